@@ -1,0 +1,34 @@
+"""A network that a CPU can train, on the CAD shapes inside the package.
+
+python train.py --config=configs/cad.py
+"""
+
+from ml_collections import ConfigDict
+
+from configs import modelnet
+
+
+def get_config() -> ConfigDict:
+    """The differences from the paper's ModelNet40 settings."""
+    config = modelnet.get_config()
+    config.model.overlap_channels = 16
+    config.model.overlap_blocks = 2
+    config.model.registration_channels = 16
+    config.model.shared_blocks = 1
+    config.model.rotation_blocks = 1
+    config.model.translation_blocks = 1
+    config.model.neighbours = 16
+    config.model.neighbour_space = "coordinates"  # one search per level instead of ten
+    config.model.dropout = 0.0  # too small to overfit pairs that never repeat
+
+    config.data.name = "cad"
+    config.train.learning_rate = 1e-3
+    config.train.clip_norm = 1.0
+    config.train.ema_decay = 0.999
+    config.train.warmup_epochs = 2.0
+    config.train.validate_every = 400
+    config.train.checkpoint_every = 200
+    config.train.validation_pairs = 96
+    config.overlap.epochs = 100.0
+    config.registration.epochs = 100.0
+    return config

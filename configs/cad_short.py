@@ -1,0 +1,20 @@
+"""A first look: the CAD configuration trained for a few minutes on two cores.
+
+python train.py --config=configs/cad_short.py
+"""
+
+from ml_collections import ConfigDict
+
+from configs import cad
+
+
+def get_config() -> ConfigDict:
+    """The differences from the full CAD training."""
+    config = cad.get_config()
+    config.train.ema_decay = 0.99  # a memory of a hundred steps, of the few hundred there are
+    config.train.warmup_epochs = 0.25
+    config.train.validate_every = 100
+    config.train.checkpoint_every = 100
+    config.overlap.epochs = 2.0
+    config.registration.epochs = 4.0
+    return config

@@ -1,0 +1,20 @@
+"""Partial-to-partial point-cloud registration in JAX: DBDNet (Li, Zhu & Xie 2024).
+
+The public surface is what this module exports; everything else may change.
+"""
+
+from dbdnet_jax.model.dbdnet import register
+from dbdnet_jax.released import from_released, to_released
+from dbdnet_jax.types import Registration
+from dbdnet_jax.weights import load_params, load_pretrained, save_params
+
+__version__ = "0.1.0"
+__all__ = [
+    "Registration",
+    "from_released",
+    "load_params",
+    "load_pretrained",
+    "register",
+    "save_params",
+    "to_released",
+]

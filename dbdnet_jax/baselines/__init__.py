@@ -1,0 +1,1 @@
+"""Classical methods to measure against, each (source, target) -> Rigid."""

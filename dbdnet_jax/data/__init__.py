@@ -1,0 +1,1 @@
+"""Data sets and the protocol that turns shapes into pairs."""

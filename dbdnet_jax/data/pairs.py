@@ -1,0 +1,145 @@
+"""The paper's protocol: how one shape becomes a pair of partial, moved and noisy clouds.
+
+A pair is drawn in two steps: a `Recipe` holds every random choice, and `assemble` follows it. A
+frozen test set is a file of recipes, so it is small, and the same on every machine.
+"""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from dbdnet_jax.ops import rigid
+from dbdnet_jax.ops.grouping import squared_distances
+from dbdnet_jax.ops.sampling import half_space_crop, random_direction, resample
+from dbdnet_jax.types import Cloud, Pair, Rigid
+
+
+@dataclasses.dataclass(frozen=True)
+class Protocol:
+    """How pairs are made; lengths are in units of the shape's radius (metres for scans)."""
+
+    points: int = 1024  # drawn from the shape for each cloud, before the crop
+    keep: float = 0.7  # the part of them that a random half-space cut leaves
+    max_angle_deg: float = 45.0  # of each Euler angle
+    max_translation: float = 1.0  # of each component
+    noise_sigma: float = 0.01  # of the Gaussian added to every coordinate after the crop
+    noise_clip: float = 0.05
+    disjoint: bool = False  # no point of the shape in both clouds: no exact counterparts
+    overlap_radius: float = 0.1  # a point overlaps when the other cloud comes closer than this
+
+    def __post_init__(self):
+        """Refuse what cannot be drawn."""
+        if self.size < 4:
+            raise ValueError(
+                "a protocol must leave at least 4 points: round(points * keep); got "
+                f"points={self.points}, keep={self.keep}. Raise one of the two."
+            )
+        if not 0.0 < self.keep <= 1.0:
+            raise ValueError(f"keep must be in (0, 1]; got {self.keep}. Use 0.7 as the paper.")
+        for name in ("max_angle_deg", "max_translation", "noise_sigma", "noise_clip"):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ValueError(
+                    f"{name} must be finite and not negative; got {getattr(self, name)}."
+                )
+        if not self.overlap_radius > 0.0:
+            raise ValueError(f"overlap_radius must be positive; got {self.overlap_radius}.")
+
+    @property
+    def size(self) -> int:
+        """Points of each cloud after the crop."""
+        return round(self.points * self.keep)
+
+
+class Recipe(NamedTuple):
+    """Every random choice of one pair: rows of the shape, the source's motion, the noise."""
+
+    source_rows: Int[Array, " n"]
+    target_rows: Int[Array, " n"]
+    source_from_target: Rigid
+    source_noise: Float[Array, "n 3"]
+    target_noise: Float[Array, "n 3"]
+
+
+def make_pair(
+    key: PRNGKeyArray,
+    points: Float[Array, "s 3"],
+    normals: Float[Array, "s 3"],
+    protocol: Protocol,
+) -> Pair:
+    """One pair of a shape under the protocol: a pure function of the key."""
+    return assemble(draw_recipe(key, points, protocol), points, normals, protocol.overlap_radius)
+
+
+def draw_recipe(key: PRNGKeyArray, points: Float[Array, "s 3"], protocol: Protocol) -> Recipe:
+    """Choose the points, the crops, the motion and the noise of one pair.
+
+    Both clouds are drawn from the shape independently (`disjoint`: from two halves of it), and
+    each is cut by a plane of its own. Fewer points than asked for are repeated.
+
+    Raises:
+        ValueError: a disjoint draw of more points than the shape has.
+    """
+    rows_key, crop_key, motion_key, noise_key = jax.random.split(key, 4)
+    total = points.shape[0]
+    if protocol.disjoint:
+        if 2 * protocol.points > total:
+            raise ValueError(
+                f"disjoint clouds of {protocol.points} points need shapes of at least "
+                f"{2 * protocol.points}; got {total}. Lower points, or set disjoint=False."
+            )
+        order = jax.random.permutation(rows_key, total)
+        rows = order[: protocol.points], order[protocol.points : 2 * protocol.points]
+    else:
+        rows = tuple(resample(k, total, protocol.points) for k in jax.random.split(rows_key))
+    cropped = [
+        drawn[half_space_crop(points[drawn], random_direction(k), protocol.size)]
+        for drawn, k in zip(rows, jax.random.split(crop_key), strict=True)
+    ]
+    motion = rigid.random_rigid(
+        motion_key, math.radians(protocol.max_angle_deg), protocol.max_translation
+    )
+    noise = protocol.noise_sigma * jax.random.normal(noise_key, (2, protocol.size, 3))
+    noise = jnp.clip(noise, -protocol.noise_clip, protocol.noise_clip)
+    return Recipe(cropped[0], cropped[1], motion, noise[0], noise[1])
+
+
+def assemble(
+    recipe: Recipe,
+    points: Float[Array, "s 3"],
+    normals: Float[Array, "s 3"],
+    overlap_radius: float,
+) -> Pair:
+    """Follow a recipe on a shape's points (s, 3) and unit normals (s, 3).
+
+    The source is the moved cloud, so the true pose is the inverse of the drawn motion.
+    """
+    moved = rigid.apply(recipe.source_from_target, points[recipe.source_rows])
+    turned = rigid.apply(
+        Rigid(recipe.source_from_target.rotation, jnp.zeros(3)), normals[recipe.source_rows]
+    )
+    source = moved + recipe.source_noise
+    target = points[recipe.target_rows] + recipe.target_noise
+    target_from_source = rigid.invert(recipe.source_from_target)
+    overlap = _overlap_labels(rigid.apply(target_from_source, source), target, overlap_radius)
+    size = jnp.asarray(source.shape[0])
+    return Pair(
+        source=Cloud(source, size),
+        target=Cloud(target, size),
+        target_from_source=target_from_source,
+        source_overlap=overlap[0],
+        target_overlap=overlap[1],
+        source_normals=turned,
+        target_normals=normals[recipe.target_rows],
+    )
+
+
+def _overlap_labels(
+    aligned: Float[Array, "n 3"], target: Float[Array, "m 3"], radius: float
+) -> tuple[Bool[Array, " n"], Bool[Array, " m"]]:
+    """Which points have a neighbour in the other cloud closer than ``radius``, once aligned."""
+    near = squared_distances(aligned, target) < radius * radius
+    return jnp.any(near, axis=1), jnp.any(near, axis=0)

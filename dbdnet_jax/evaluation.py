@@ -1,0 +1,223 @@
+"""Every method on the same test pairs, one pair at a time: errors and wall time."""
+
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+from dbdnet_jax.baselines.classical import (
+    MissingBaselineError,
+    fgr,
+    fgr_estimated,
+    icp,
+    icp_centred,
+    identity,
+)
+from dbdnet_jax.metrics import (
+    OverlapSummary,
+    PairErrors,
+    Summary,
+    motion_errors,
+    pair_confusion,
+    registration_errors,
+    summarise,
+    summarise_overlap,
+)
+from dbdnet_jax.model.dbdnet import register, register_given_overlap
+from dbdnet_jax.model.params import Params, init_params
+from dbdnet_jax.ops.sampling import prefix_mask
+from dbdnet_jax.pair_sets import load_test_pairs
+from dbdnet_jax.settings import Settings
+from dbdnet_jax.types import Pair, Registration, Rigid
+
+Method = Callable[[Pair], Rigid | Registration]
+
+
+class Row(NamedTuple):
+    """One method's line of a table; without a summary, the note says why it could not run."""
+
+    method: str
+    summary: Summary | None
+    seconds_per_pair: float | None
+    note: str = ""
+
+
+class Evaluation(NamedTuple):
+    """Rows, what a constant scores beside them, and all that is needed to get them again."""
+
+    rows: Sequence[Row]
+    constant_overlap: OverlapSummary
+    pair_set: str
+    pairs: int
+    pairs_hash: str
+    seed: int
+    command: str
+    device: str
+
+
+def evaluate(
+    settings: Settings,
+    params: Params,
+    run_dir: str | Path,
+    *,
+    command: str,
+    benchmark: str = "3DMatch",
+    count: int | None = None,
+) -> Evaluation:
+    """Score the network, itself untrained, and the baselines on the test pairs of ``settings``.
+
+    ``count`` keeps the first pairs only, which the name then says (the hash stays that of the
+    whole set); ``command`` is what to show as the way to get here.
+
+    Raises:
+        ValueError: params without a registration network; otherwise as `load_test_pairs`.
+    """
+    if params.registration is None:
+        raise ValueError(
+            "an evaluation needs a registration network; these params hold only the overlap "
+            "network. Train it too: python train.py --stage=registration"
+        )
+    name, pairs, digest = load_test_pairs(settings, run_dir, benchmark)
+    if count is not None and count < len(pairs.source.count):
+        name = f"{name}_first_{count}"
+        pairs = jax.tree.map(lambda leaf: leaf[:count], pairs)
+    methods = make_methods(params, settings.train.seed)
+    if not pairs.source_normals.any():  # scans come without
+        del methods["FGR, true normals"]
+    return Evaluation(
+        rows=evaluate_methods(methods, pairs),
+        constant_overlap=constant_overlap(pairs),
+        pair_set=name,
+        pairs=len(pairs.source.count),
+        pairs_hash=digest,
+        seed=settings.train.seed,
+        command=command,
+        device=f"{jax.devices()[0].device_kind}, {os.cpu_count()} cores",
+    )
+
+
+def make_methods(params: Params, seed: int) -> dict[str, Method]:
+    """The rows of the table by name; ``seed`` is that of the untrained weights.
+
+    Params without an overlap network are given the true overlap, and the name says so.
+    """
+    untrained = init_params(jax.random.key(seed), params.config)
+    network, name = from_network, "DBDNet"
+    if params.overlap is None:
+        network, name = from_true_overlap, "DBDNet, true overlap given"
+    return {
+        "identity": from_points(identity),
+        "ICP": from_points(icp),
+        "ICP, centroids first": from_points(icp_centred),
+        "FGR, true normals": from_normals(fgr),
+        "FGR, estimated normals": from_points(fgr_estimated),
+        f"{name} (untrained)": network(untrained),
+        name: network(params),
+    }
+
+
+def from_points(baseline: Callable[..., Rigid]) -> Method:
+    """A baseline ``(source, target) -> Rigid`` as a method on pairs; padding is cut off."""
+
+    def method(pair: Pair) -> Rigid:
+        return baseline(
+            pair.source.points[: pair.source.count], pair.target.points[: pair.target.count]
+        )
+
+    return method
+
+
+def from_normals(baseline: Callable[..., Rigid]) -> Method:
+    """A baseline that also takes ``source_normals=, target_normals=`` as a method on pairs."""
+
+    def method(pair: Pair) -> Rigid:
+        rows, columns = slice(pair.source.count), slice(pair.target.count)
+        return baseline(
+            pair.source.points[rows],
+            pair.target.points[columns],
+            source_normals=pair.source_normals[rows],
+            target_normals=pair.target_normals[columns],
+        )
+
+    return method
+
+
+def from_network(params: Params) -> Method:
+    """The network as a method on pairs; compiled once per shape and model configuration."""
+    compiled = jax.jit(_register)
+    return lambda pair: compiled(params, pair)
+
+
+def from_true_overlap(params: Params) -> Method:
+    """The registration network behind the true overlap labels: a bound, since it is told them.
+
+    Its row has no overlap figures.
+    """
+    compiled = jax.jit(_register_given_labels)
+    return lambda pair: compiled(params, pair)
+
+
+def evaluate_method(name: str, method: Method, pairs: Pair) -> Row:
+    """One method over stacked NumPy pairs (leading axis on every field).
+
+    The time is the median over the pairs of the wall seconds until the answer is there. The
+    method is called once on the first pair beforehand, so that no compilation is in it. A method
+    whose library is missing gives a row with a note instead of figures.
+    """
+    score = jax.jit(_score)
+    errors: list[PairErrors] = []
+    seconds: list[float] = []
+    try:
+        jax.block_until_ready(method(_pair(pairs, 0)))
+        for i in range(len(pairs.source.count)):
+            pair = _pair(pairs, i)
+            start = time.perf_counter()
+            answer = jax.block_until_ready(method(pair))
+            seconds.append(time.perf_counter() - start)
+            errors.append(jax.device_get(score(answer, pair)))
+    except MissingBaselineError as error:
+        return Row(name, None, None, str(error))
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *errors)
+    return Row(name, summarise(stacked), float(np.median(seconds)))
+
+
+def evaluate_methods(methods: Mapping[str, Method], pairs: Pair) -> list[Row]:
+    """One row per method, in the given order, all on the same pairs; shows its progress."""
+    bar = tqdm(methods.items(), desc="evaluating", unit="method", leave=False, disable=None)
+    return [evaluate_method(name, method, pairs) for name, method in bar]
+
+
+def constant_overlap(pairs: Pair) -> OverlapSummary:
+    """What the answer "all points overlap" scores on stacked pairs, for comparison."""
+    ones = jnp.ones(pairs.source_overlap.shape), jnp.ones(pairs.target_overlap.shape)
+    summary = summarise_overlap(jax.vmap(pair_confusion)(*ones, pairs))
+    assert summary is not None  # a pair has points
+    return summary
+
+
+def _pair(pairs: Pair, i: int) -> Pair:
+    return jax.tree.map(lambda leaf: leaf[i], pairs)
+
+
+def _register(params: Params, pair: Pair) -> Registration:
+    source, target = pair.source, pair.target
+    masks = (prefix_mask(len(cloud.points), cloud.count) for cloud in (source, target))
+    return register(params, source.points, target.points, *masks)
+
+
+def _register_given_labels(params: Params, pair: Pair) -> Rigid:
+    labels = (x.astype(jnp.float32) for x in (pair.source_overlap, pair.target_overlap))
+    answer = register_given_overlap(params, pair.source, pair.target, *labels)
+    return Rigid(answer.rotation, answer.translation)
+
+
+def _score(answer: Rigid | Registration, pair: Pair) -> PairErrors:
+    if isinstance(answer, Registration):
+        return registration_errors(answer, pair)
+    return motion_errors(answer, pair.target_from_source)

@@ -1,0 +1,1 @@
+"""The networks: flax.linen modules that hold parameters and call the operations."""

@@ -1,0 +1,188 @@
+"""The small layers: affine maps, masked group norm, moves between levels, attention blocks.
+
+Every layer works on one cloud of static size whose valid rows are given by a mask. Parameters are
+cast to the features' type, so a network given float64 computes in float64 throughout.
+"""
+
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from dbdnet_jax.ops.attention import attention
+from dbdnet_jax.ops.grouping import interpolate, max_over_neighbours
+
+NORM_EPSILON = 1e-5  # torch's default, which the released weights were trained with
+LEAKY_SLOPE = 0.2
+
+
+class Affine(nn.Module):
+    """Kernel (in, out) and bias (out,) of an affine map, for layers that apply them in pieces.
+
+    Declared as zeros: `params.init_params` draws the values of the whole network at once.
+    """
+
+    features: int
+
+    @nn.compact
+    def __call__(
+        self, fan_in: int, dtype: jnp.dtype
+    ) -> tuple[Float[Array, "in out"], Float[Array, " out"]]:
+        """Declare and return both, cast to ``dtype``."""
+        kernel = self.param("kernel", nn.initializers.zeros, (fan_in, self.features))
+        bias = self.param("bias", nn.initializers.zeros, (self.features,))
+        return kernel.astype(dtype), bias.astype(dtype)
+
+
+def dense(affine: Affine, x: Float[Array, "n c"]) -> Float[Array, "n d"]:
+    """Apply an affine map to every row: a 1 x 1 convolution."""
+    kernel, bias = affine(x.shape[-1], x.dtype)
+    return x @ kernel + bias[None, :]
+
+
+class Norm(nn.Module):
+    """Scale and bias of a group normalisation, and how statistics become one affine map."""
+
+    groups: int
+
+    @nn.compact
+    def __call__(
+        self, mean: Float[Array, " c"], variance: Float[Array, " c"]
+    ) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
+        """The map ``slope * x + offset`` from the mean and variance of each channel.
+
+        A group's variance is the mean of its channels' variances plus the variance of their
+        means (Wu & He 2018).
+        """
+        channels, dtype = mean.shape[0], mean.dtype
+        scale = self.param("scale", nn.initializers.ones, (channels,)).astype(dtype)
+        bias = self.param("bias", nn.initializers.zeros, (channels,)).astype(dtype)
+        mean, variance = mean.reshape(self.groups, -1), variance.reshape(self.groups, -1)
+        centre = jnp.mean(mean, axis=1, keepdims=True)
+        spread = jnp.mean(variance + (mean - centre) ** 2, axis=1, keepdims=True)
+        inverse = jnp.broadcast_to(jax.lax.rsqrt(spread + NORM_EPSILON), mean.shape)
+        slope = scale * inverse.reshape(-1)
+        return slope, bias - slope * jnp.broadcast_to(centre, mean.shape).reshape(-1)
+
+
+class DenseNorm(nn.Module):
+    """Dense, group normalisation over the valid rows, ReLU.
+
+    Flax's own GroupNorm normalises each point alone on an unbatched cloud, and knows no padding.
+    """
+
+    features: int
+    groups: int
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "n c"], valid: Bool[Array, " n"]) -> Float[Array, "n d"]:
+        """Map, normalise, rectify; rows that are not valid enter no statistic."""
+        x = dense(Affine(self.features, name="conv"), x)
+        weight = valid.astype(x.dtype) / jnp.maximum(jnp.sum(valid), 1).astype(x.dtype)
+        mean = weight @ x
+        centred = jnp.where(valid[:, None], x - mean[None, :], 0.0)
+        slope, offset = Norm(self.groups, name="norm")(mean, weight @ (centred * centred))
+        return nn.relu(x * slope[None, :] + offset[None, :])
+
+
+class Exchange(nn.Module):
+    """Dense + ReLU: what a feature passes through on its way to another level."""
+
+    features: int
+
+    def setup(self):
+        """Declare the affine map."""
+        self.conv = Affine(self.features)
+
+    def down(self, x: Float[Array, "n c"]) -> Float[Array, "n d"]:
+        """Query-down: the rows are already those of the coarser level."""
+        return nn.relu(dense(self.conv, x))
+
+    def pool(self, x: Float[Array, "n c"], index: Int[Array, "m k"]) -> Float[Array, "m d"]:
+        """Transition-down: the maximum of dense + ReLU over each kept point's neighbours.
+
+        Rectifying is monotone, so the dense layer runs once per point instead of once per
+        neighbour, and the maximum is rectified.
+        """
+        return nn.relu(max_over_neighbours(dense(self.conv, x), index))
+
+    def up(
+        self, x: Float[Array, "m c"], index: Int[Array, "n 3"], weight: Float[Array, "n 3"]
+    ) -> Float[Array, "n d"]:
+        """Transition-up: interpolate the coarse feature at the finer points, then dense + ReLU.
+
+        The weights sum to one, so the affine map may run first, on the fewer coarse rows.
+        """
+        return nn.relu(interpolate(dense(self.conv, x), index, weight))
+
+
+class MultiHeadAttention(nn.Module):
+    """Multi-head attention with biases: a packed input projection and an output projection."""
+
+    heads: int
+    dropout: float
+
+    @nn.compact
+    def __call__(
+        self,
+        query: Float[Array, "n d"],
+        memory: Float[Array, "m d"],
+        memory_valid: Bool[Array, " m"],
+        dropout_key: PRNGKeyArray | None,
+    ) -> Float[Array, "n d"]:
+        """Attend from every query row to the valid memory rows."""
+        width = query.shape[-1]
+        packed = Affine(3 * width, name="in_proj")
+        kernels, biases = (jnp.split(x, 3, axis=-1) for x in packed(width, query.dtype))
+        q, k, v = (
+            x @ kernel + bias[None, :]
+            for x, kernel, bias in zip((query, memory, memory), kernels, biases, strict=True)
+        )
+        out = attention(
+            q, k, v, memory_valid, self.heads, dropout=self.dropout, dropout_key=dropout_key
+        )
+        return dense(Affine(width, name="out_proj"), out)
+
+
+class AttentionBlock(nn.Module):
+    """Self-attention, then cross-attention: residual, followed by LayerNorm (eps 1e-5).
+
+    One set of weights serves both clouds, and both directions of the cross step read the features
+    from before it.
+    """
+
+    heads: int
+    dropout: float
+
+    @nn.compact
+    def __call__(
+        self,
+        features: Float[Array, "2 n d"],
+        valid: Bool[Array, "2 n"],
+        dropout_key: PRNGKeyArray | None = None,
+    ) -> Float[Array, "2 n d"]:
+        """Update both clouds' features; without a ``dropout_key`` nothing is dropped."""
+        for step in ("self", "cross"):
+            attend = MultiHeadAttention(self.heads, self.dropout, name=f"{step}_attention")
+            norm = nn.LayerNorm(epsilon=NORM_EPSILON, name=f"{step}_layer_norm")
+            memory, memory_valid = features, valid
+            if step == "cross":
+                memory, memory_valid = features[::-1], valid[::-1]
+            keys = None
+            if dropout_key is not None:
+                dropout_key, *keys = jax.random.split(dropout_key, 3)
+                keys = jnp.stack(keys)
+            features = norm(features + over_clouds(attend, features, memory, memory_valid, keys))
+        return features
+
+
+def over_clouds(module: nn.Module, *stacked: Any) -> Array:
+    """Apply a module to both clouds of stacked arguments: one set of weights, compiled once."""
+
+    def one(module, carry, arguments):
+        return carry, module(*arguments)
+
+    both = nn.scan(one, variable_broadcast="params", split_rngs={"params": False})
+    return both(module, (), stacked)[1]

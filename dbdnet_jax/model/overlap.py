@@ -1,0 +1,56 @@
+"""The overlap network: which points of each cloud have a counterpart in the other one."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from dbdnet_jax.model.blocks import Affine, AttentionBlock, DenseNorm, dense, over_clouds
+from dbdnet_jax.model.config import ModelConfig
+from dbdnet_jax.model.encoder import Encoder
+from dbdnet_jax.ops.attention import position_code
+from dbdnet_jax.ops.grouping import masked_max
+from dbdnet_jax.ops.sampling import prefix_mask
+from dbdnet_jax.types import Cloud
+
+HEAD = ((512, 8), (256, 8), (128, 4))  # (features, groups) of the decoder's layers
+
+
+class OverlapNetwork(nn.Module):
+    """Overlap logits of both clouds (paper, section III-B)."""
+
+    config: ModelConfig
+
+    @nn.compact
+    def __call__(
+        self,
+        clouds: Cloud,
+        skip_rows: Int[Array, "2 n"] | None = None,
+        dropout_key: PRNGKeyArray | None = None,
+    ) -> Float[Array, "2 n"]:
+        """Logits of the points of two clouds, stacked, each in farthest-point order.
+
+        Rows past a cloud's count hold logits without meaning. Without a ``dropout_key`` the
+        network is deterministic.
+        """
+        config = self.config
+        encoder = Encoder(
+            config.overlap_channels, config.neighbours, config.neighbour_space, name="encoder"
+        )
+        features = over_clouds(encoder, clouds, skip_rows)
+        n, width = features.shape[1:]
+        features = features + jax.vmap(lambda x: position_code(x, width))(clouds.points)
+        valid = jax.vmap(lambda count: prefix_mask(n, count))(clouds.count)
+        keys = [None] * config.overlap_blocks
+        if dropout_key is not None:
+            keys = list(jax.random.split(dropout_key, config.overlap_blocks))
+        for block, key in enumerate(keys):
+            attend = AttentionBlock(config.heads, config.dropout, name=f"attention_{block}")
+            features = attend(features, valid, key)
+        pooled = jax.vmap(masked_max)(features, valid)[::-1]  # of the other cloud
+        other = jnp.broadcast_to(pooled[:, None, :], features.shape)
+        features = jnp.concatenate([features, other], axis=-1)
+        for layer, (size, groups) in enumerate(HEAD):
+            decode = DenseNorm(size, groups, name=f"decoder_{layer}")
+            features = over_clouds(decode, features, valid)
+        return dense(Affine(1, name="linear"), features.reshape(2 * n, -1)).reshape(2, n)

@@ -1,0 +1,1 @@
+"""One pair or one cloud at a time: pure functions without parameters."""

@@ -1,0 +1,80 @@
+"""Choosing rows of one cloud: farthest-point order, prefixes, resampling, half-space crops."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+
+def prefix_mask(n: int, count: Int[Array, ""]) -> Bool[Array, " n"]:
+    """True for the first ``count`` of n rows: the valid points of a cloud of static size."""
+    return jnp.arange(n) < count
+
+
+def prefix_order(keep: Bool[Array, " n"]) -> Int[Array, " n"]:
+    """The row order that brings the kept rows to the front and changes nothing else."""
+    return jnp.argsort(~keep, stable=True)
+
+
+def inverse_order(order: Int[Array, " n"]) -> Int[Array, " n"]:
+    """The order that undoes ``order``: ``x[order][inverse_order(order)] == x``."""
+    rows = jnp.arange(order.shape[0], dtype=order.dtype)
+    return jnp.zeros_like(order).at[order].set(rows)
+
+
+def farthest_order(points: Float[Array, "n 3"], count: Int[Array, ""]) -> Int[Array, " n"]:
+    """A row order whose first ``count // 2`` rows are farthest-point samples from row 0.
+
+    Each next row is the valid point farthest from all rows before it (Gonzalez 1985; the lower
+    row on ties). The other valid rows follow in their given order, then the padding. The sampling
+    is greedy, so the first rows of the reordered cloud are farthest-point samples of any longer
+    prefix too: in this order every level of a pyramid is a prefix. Clouds of fewer than four
+    points keep their order.
+    """
+    n = points.shape[0]
+    rows = jnp.arange(n)
+    # Padding starts below every distance, so that it is never the farthest.
+    start = jnp.where(rows < count, jnp.inf, -1.0).astype(points.dtype)
+
+    def step(i, carry):
+        distance, last, rank = carry
+        rank = rank.at[last].set(jnp.where(i < count // 2, i, rank[last]))
+        offset = points - points[last][None, :]
+        offset = jnp.sum(offset * offset, axis=-1)
+        # A row once taken must not be taken again, even among duplicates at distance zero.
+        distance = jnp.minimum(distance, offset).at[last].set(-1.0)
+        return distance, jnp.argmax(distance), rank
+
+    rank = jnp.where(rows < count, n + rows, 2 * n + rows)
+    _, _, rank = jax.lax.fori_loop(0, n // 2, step, (start, jnp.zeros((), rows.dtype), rank))
+    return jnp.argsort(rank)
+
+
+def resample(key: PRNGKeyArray, n: int, size: int) -> Int[Array, " size"]:
+    """Indices of ``size`` of n rows: a random subset, or, if size > n, all rows and repeats.
+
+    Every row is drawn at least once when ``size >= n``; the order is random.
+    """
+    subset_key, repeat_key = jax.random.split(key)
+    order = jax.random.permutation(subset_key, n)
+    if size <= n:
+        return order[:size]
+    return jnp.concatenate([order, jax.random.randint(repeat_key, (size - n,), 0, n)])
+
+
+def random_direction(key: PRNGKeyArray) -> Float[Array, "3"]:
+    """A unit vector, uniform on the sphere."""
+    vector = jax.random.normal(key, (3,))
+    return vector / jnp.linalg.norm(vector)
+
+
+def half_space_crop(
+    points: Float[Array, "n 3"], direction: Float[Array, "3"], size: int
+) -> Int[Array, " size"]:
+    """Indices of the ``size`` points farthest along ``direction``, in their given order.
+
+    That is a cut by a plane normal to ``direction``, placed so that exactly ``size`` points
+    remain (RPM-Net, Yew & Lee 2020).
+    """
+    along = jnp.sum(points * direction[None, :], axis=-1)
+    _, rows = jax.lax.top_k(along, size)
+    return jnp.sort(rows)

@@ -1,0 +1,202 @@
+"""Tables of results: as text for people, as CSV and JSON for programs.
+
+Every column head carries its definition and unit, and every table the command, the seed and the
+hash of the test pairs that it came from.
+"""
+
+import csv
+import io
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from dbdnet_jax.evaluation import Evaluation, Row
+from dbdnet_jax.metrics import OverlapSummary, Summary
+
+CONSTANT_NAME = "all points overlapping (constant)"
+
+
+class Column(NamedTuple):
+    """Three lines of head (name, definition, unit) and how a cell is written."""
+
+    head: tuple[str, str, str]
+    cell: Callable[[Row], str]
+
+
+def _figure(field: str, digits: int) -> Callable[[Row], str]:
+    def cell(row: Row) -> str:
+        return "-" if row.summary is None else f"{getattr(row.summary, field):.{digits}f}"
+
+    return cell
+
+
+def _percent(field: str) -> Callable[[Row], str]:
+    def cell(row: Row) -> str:
+        return "-" if row.summary is None else f"{100 * getattr(row.summary, field):.1f} %"
+
+    return cell
+
+
+def _seconds(row: Row) -> str:
+    return "-" if row.seconds_per_pair is None else f"{row.seconds_per_pair:.3f}"
+
+
+MOTION_COLUMNS = (
+    Column(("RMSE R", "Euler", "deg"), _figure("rmse_euler_deg", 3)),
+    Column(("RMSE t", "x, y, z", "unit"), _figure("rmse_translation", 4)),
+    Column(("MAE R", "Euler", "deg"), _figure("mae_euler_deg", 3)),
+    Column(("MAE t", "x, y, z", "unit"), _figure("mae_translation", 4)),
+    Column(("Error R", "mean", "deg"), _figure("error_rotation_deg", 3)),
+    Column(("Error t", "mean", "unit"), _figure("error_translation", 4)),
+    Column(("Error R", "median", "deg"), _figure("median_rotation_deg", 3)),
+    Column(("Error t", "median", "unit"), _figure("median_translation", 4)),
+    Column(("Recall", "< 5 deg", "& < 0.1"), _percent("recall_5deg_0p1")),
+    Column(("Recall", "< 15 deg", "& < 0.3"), _percent("recall_15deg_30cm")),
+    Column(("Time", "median", "s/pair"), _seconds),
+)
+OVERLAP_HEADS = (
+    ("Accuracy", "right /", "all points"),
+    ("Precision", "TP /", "(TP + FP)"),
+    ("Recall", "TP /", "(TP + FN)"),
+    ("F1", "2 TP /", "(2 TP+FP+FN)"),
+)
+DEFINITIONS = """\
+RMSE, MAE: over all pairs and the three components of the predicted minus the true Euler angles
+(xyz, extrinsic, not wrapped) and translation. Error R: angle of R_true^T R (geodesic). Error t:
+norm of the translation of T_true^-1 T. Recall: share of pairs with both errors below. Unit: that of
+the clouds. An answer that is not finite counts as 180 deg and 2 |t_true|. Time: wall clock, one
+pair at a time, compilation excluded."""
+OVERLAP_DEFINITIONS = """\
+Probability > 0.5 counts as overlapping; TP, FP, FN pooled over the points of both clouds of all
+pairs."""
+
+
+def render(evaluation: Evaluation) -> str:
+    """Both tables as fixed-width text, with the definitions and where the figures come from."""
+    heads = [("method", "", ""), *(column.head for column in MOTION_COLUMNS)]
+    body = [
+        [row.method, *(column.cell(row) for column in MOTION_COLUMNS)] for row in evaluation.rows
+    ]
+    parts = [_table(heads, body), DEFINITIONS, *_remarks(evaluation.rows)]
+    predicted = [
+        (row.method, row.summary.overlap)
+        for row in evaluation.rows
+        if row.summary is not None and row.summary.overlap is not None
+    ]
+    if predicted:
+        constant = evaluation.constant_overlap
+        body = [
+            [name, *(f"{value:.4f}" for value in overlap)]
+            for name, overlap in [*predicted, (CONSTANT_NAME, constant)]
+        ]
+        parts += ["", _table([("overlap prediction", "", ""), *OVERLAP_HEADS], body)]
+        parts.append(OVERLAP_DEFINITIONS)
+        parts += [
+            f"{name}: accuracy and F1 are not both above those of the constant answer, so they "
+            "show no skill at finding the overlap."
+            for name, overlap in predicted
+            if overlap.accuracy <= constant.accuracy or overlap.f1 <= constant.f1
+        ]
+    return "\n".join([*parts, "", _provenance(evaluation)])
+
+
+def save(evaluation: Evaluation, folder: str | Path) -> None:
+    """Write ``evaluation_SET.csv`` and ``.json`` into ``folder``, named by the set of pairs."""
+    stem = Path(folder) / f"evaluation_{evaluation.pair_set}"
+    write_csv(stem.with_suffix(".csv"), evaluation)
+    write_json(stem.with_suffix(".json"), evaluation)
+
+
+def write_csv(path: str | Path, evaluation: Evaluation) -> None:
+    """One line per method (and one for the constant overlap), a column per figure; atomic.
+
+    A figure that does not exist is an empty cell. The provenance stands on every line.
+    """
+    text = io.StringIO()
+    lines = [*(_flat(row) for row in evaluation.rows), _flat_constant(evaluation)]
+    provenance = _provenance_fields(evaluation)
+    writer = csv.DictWriter(text, [*lines[0], *provenance], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(line | provenance for line in lines)
+    _write_atomically(Path(path), text.getvalue())
+
+
+def write_json(path: str | Path, evaluation: Evaluation) -> None:
+    """The same figures as one JSON object: provenance, then ``rows``; atomic."""
+    lines = [*(_flat(row) for row in evaluation.rows), _flat_constant(evaluation)]
+    content = _provenance_fields(evaluation) | {"rows": lines}
+    _write_atomically(Path(path), json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+def _table(heads: Sequence[tuple[str, str, str]], body: Sequence[Sequence[str]]) -> str:
+    """Fixed-width columns two spaces apart, the first to the left, the others to the right."""
+    lines = [list(line) for line in zip(*heads, strict=True)]
+    widths = [max(map(len, cells)) for cells in zip(*lines, *body, strict=True)]
+    rule = "-" * (sum(widths) + 2 * (len(widths) - 1))
+
+    def line(cells: Sequence[str]) -> str:
+        first, *rest = zip(cells, widths, strict=True)
+        return "  ".join([first[0].ljust(first[1]), *(c.rjust(w) for c, w in rest)]).rstrip()
+
+    return "\n".join([*map(line, lines), rule, *map(line, body), rule])
+
+
+def _remarks(rows: Sequence[Row]) -> list[str]:
+    remarks = [f"{row.method}: {row.note}" for row in rows if row.note]
+    return remarks + [
+        f"{row.method}: {row.summary.non_finite} of {row.summary.pairs} answers were not finite."
+        for row in rows
+        if row.summary is not None and row.summary.non_finite
+    ]
+
+
+def _provenance(evaluation: Evaluation) -> str:
+    return (
+        f"{evaluation.pairs} pairs of {evaluation.pair_set}, sha256 {evaluation.pairs_hash}; "
+        f"seed {evaluation.seed}; {evaluation.device}\n{evaluation.command}"
+    )
+
+
+def _provenance_fields(evaluation: Evaluation) -> dict[str, Any]:
+    return {
+        key: value
+        for key, value in evaluation._asdict().items()
+        if key not in ("rows", "constant_overlap")
+    }
+
+
+def _flat(row: Row) -> dict[str, Any]:
+    summary = dict.fromkeys(Summary._fields) if row.summary is None else row.summary._asdict()
+    overlap = summary.pop("overlap")
+    del summary["pairs"]  # the report's own figure
+    return (
+        {"method": row.method}
+        | summary
+        | _flat_overlap(overlap)
+        | {"seconds_per_pair": row.seconds_per_pair, "note": row.note}
+    )
+
+
+def _flat_overlap(overlap: OverlapSummary | None) -> dict[str, Any]:
+    values = overlap or (None,) * len(OverlapSummary._fields)
+    return {
+        f"overlap_{field}": value
+        for field, value in zip(OverlapSummary._fields, values, strict=True)
+    }
+
+
+def _flat_constant(evaluation: Evaluation) -> dict[str, Any]:
+    return _flat(Row(CONSTANT_NAME, None, None)) | _flat_overlap(evaluation.constant_overlap)
+
+
+def _write_atomically(path: Path, text: str) -> None:
+    """Write beside ``path``, then move: a reader sees the whole file or the one before."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)

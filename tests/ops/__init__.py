@@ -1,0 +1,1 @@
+"""Tests of the operations, against `tests/oracle.py` and libraries from outside."""

@@ -1,0 +1,114 @@
+"""A training task that compiles in a second: the loop, the checkpoints and the log do not care.
+
+As a program, it trains in the folder given: what a test kills and starts again.
+"""
+
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dbdnet_jax.data.pairs import Protocol
+from dbdnet_jax.data.shapes import Shapes
+from dbdnet_jax.settings import TrainSettings
+from dbdnet_jax.sources import Source, shape_source
+from dbdnet_jax.stages import Task
+from dbdnet_jax.training import run_task
+
+PROTOCOL = Protocol(points=24, keep=0.5)
+EPOCHS, BATCH, RATE = 6.0, 4, 0.1  # 12 steps
+TRAIN = TrainSettings(
+    seed=5,
+    batch_size=BATCH,
+    learning_rate=RATE,
+    weight_decay=1e-4,
+    warmup_epochs=1.0,
+    clip_norm=1.0,
+    ema_decay=0.9,
+    log_every=2,
+    validate_every=4,
+    checkpoint_every=2,
+    validation_pairs=3,
+    devices=0,
+)
+
+
+class Terms(NamedTuple):
+    """The terms of the stand-in's loss."""
+
+    fit: jax.Array
+    size: jax.Array
+
+
+def shapes(count: int = 8, points: int = 32, seed: int = 0) -> Shapes:
+    """Random clouds as shapes."""
+    rng = np.random.default_rng(seed)
+    text = np.full(count, "")
+    return Shapes(
+        rng.uniform(-1, 1, (count, points, 3)).astype(np.float32),
+        np.zeros((count, points, 3), np.float32),
+        *(text,) * 8,
+    )
+
+
+def source(train: Shapes | None = None) -> Source:
+    """Pairs of the random shapes."""
+    return shape_source(
+        shapes() if train is None else train,
+        shapes(2, seed=1),
+        PROTOCOL,
+        seed=TRAIN.seed,
+        validation_pairs=TRAIN.validation_pairs,
+    )
+
+
+def loss(trainable, frozen, pair, key):
+    """Learn to repeat the target's centre, seen with a little noise from the key."""
+    centre = jnp.mean(pair.target.points, axis=0)
+    seen = centre + 1e-3 * jax.random.normal(key, (3,))
+    fit = jnp.mean((seen @ trainable["matrix"] + trainable["offset"] - centre) ** 2)
+    terms = Terms(fit, 1e-3 * jnp.sum(trainable["matrix"] ** 2))
+    return terms.fit + terms.size, terms
+
+
+def validate(trainable, frozen, pair):
+    """The loss without its noise is the error."""
+    return {"error": loss(trainable, frozen, pair, jax.random.key(0))[0]}
+
+
+def task() -> Task:
+    """The stand-in for a stage."""
+    return Task({"matrix": 0.1 * jnp.ones((3, 3)), "offset": jnp.ones(3)}, None, loss, validate)
+
+
+def train(folder: Path, pairs: Source | None = None, settings: TrainSettings = TRAIN) -> None:
+    """All 12 steps, or those that are left."""
+    run_task(
+        task(),
+        source() if pairs is None else pairs,
+        folder,
+        settings,
+        epochs=EPOCHS,
+        batch_size=BATCH,
+        learning_rate=RATE,
+    )
+
+
+def slowly(pairs: Source, seconds: float) -> Source:
+    """A source that takes its time, so that there is time to be killed in."""
+
+    def arrays(start):
+        for these in pairs.arrays(start):
+            time.sleep(seconds)
+            yield these
+
+    return pairs._replace(arrays=arrays)
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_num_cpu_devices", 2)
+    train(Path(sys.argv[1]), slowly(source(), float(sys.argv[2])))

@@ -1,0 +1,159 @@
+"""The configurations say what the paper says, and a wrong one is told so in one line."""
+
+import dataclasses
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from ml_collections import ConfigDict
+
+from configs import cad, cad_short, modelnet, threedmatch
+from dbdnet_jax.data.pairs import Protocol
+from dbdnet_jax.losses import LossWeights
+from dbdnet_jax.model.config import ModelConfig
+from dbdnet_jax.settings import Settings, read_settings, stage_record
+
+ROOT = Path(__file__).parents[1]
+CONFIGS = {"modelnet": modelnet, "threedmatch": threedmatch, "cad": cad, "cad_short": cad_short}
+
+
+def train(*arguments: str) -> subprocess.CompletedProcess:
+    return subprocess.run(
+        [sys.executable, "train.py", *arguments],
+        cwd=ROOT,
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+
+def with_change(**changes: object) -> ConfigDict:
+    """The CAD configuration with fields set by their dotted names (``__`` for the dot)."""
+    config = cad.get_config()
+    with config.unlocked():
+        for name, value in changes.items():
+            *path, last = name.split("__")
+            section = config
+            for step in path:
+                section = section[step]
+            section[last] = value
+    return config
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_every_configuration_holds_exactly_the_fields_there_are(name):
+    config = CONFIGS[name].get_config()
+    assert isinstance(read_settings(config), Settings)
+    for section, record in (("model", ModelConfig), ("protocol", Protocol)):
+        assert set(config[section]) == {field.name for field in dataclasses.fields(record)}
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_configurations_are_locked(name):
+    with pytest.raises(AttributeError, match="batchsize"):
+        CONFIGS[name].get_config().train.batchsize = 4
+
+
+def test_modelnet_is_the_papers():
+    settings = read_settings(modelnet.get_config())
+    assert settings.model == ModelConfig()  # the released architecture, which a test counts
+    assert settings.protocol == Protocol(
+        points=1024,
+        keep=0.7,
+        max_angle_deg=45.0,
+        max_translation=1.0,
+        noise_sigma=0.01,
+        noise_clip=0.05,
+        disjoint=False,
+        overlap_radius=0.1,
+    )
+    assert settings.train.learning_rate == settings.train.weight_decay == 1e-4
+    assert settings.train.warmup_epochs == 5
+    assert settings.train.clip_norm == settings.train.ema_decay == 0
+    assert settings.overlap.gamma == 4
+    assert settings.registration.weights == LossWeights(
+        correspondence=5.0, rotation=1.0, translation=1.0, distance=1.0
+    )
+    assert not settings.registration.true_masks
+    for stage in (settings.overlap, settings.registration):
+        assert (stage.epochs, stage.batch_size, stage.learning_rate) == (300, 8, 1e-4)
+
+
+def test_threedmatch_is_the_papers():
+    settings = read_settings(threedmatch.get_config())
+    assert settings.model == ModelConfig()
+    assert (settings.protocol.points, settings.protocol.overlap_radius) == (2048, 0.0375)
+    assert (settings.overlap.epochs, settings.overlap.batch_size) == (150, 2)
+    assert (settings.registration.epochs, settings.registration.batch_size) == (50, 1)
+    assert settings.registration.weights == LossWeights(rotation=5.0)
+    assert settings.overlap.learning_rate == settings.registration.learning_rate == 1e-4
+
+
+def test_the_cad_configurations_keep_the_papers_protocol():
+    for config in (cad, cad_short):
+        assert read_settings(config.get_config()).protocol == Protocol()
+
+
+def test_stages_follow_the_shared_fields_until_set():
+    config = cad.get_config()
+    config.train.batch_size = 4
+    assert (config.overlap.batch_size, config.registration.batch_size) == (4, 4)
+    config.registration.batch_size = 2
+    settings = read_settings(config)
+    assert (settings.overlap.batch_size, settings.registration.batch_size) == (4, 2)
+
+
+def test_a_stage_may_resume_only_with_what_decides_its_outcome():
+    base, other = (read_settings(with_change(registration__epochs=e)) for e in (1.0, 2.0))
+    assert stage_record(base, "overlap") == stage_record(other, "overlap")
+    assert stage_record(base, "registration") != stage_record(other, "registration")
+    more_devices = read_settings(with_change(registration__epochs=1.0, train__devices=3))
+    assert stage_record(base, "registration") == stage_record(more_devices, "registration")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"model__overlap_chanels": 8}, r"config\.model\.overlap_channels\?"),
+        ({"registration__weights__rotatoin": 1.0}, r"config\.registration\.weights\.rotation\?"),
+        ({"trian": {}}, r"Did you mean config\.train\?"),
+        ({"data__name": "modelnet"}, r"one of \('cad', 'modelnet40', 'threedmatch'\); got 'mod"),
+        ({"train__log_every": 30}, r"validate_every must be a multiple of .*log_every = 30"),
+        ({"train__validation_pairs": 0}, r"validation_pairs must be at least 1; got 0"),
+        ({"overlap__epochs": 0.0}, r"config\.overlap must have epochs > 0"),
+        ({"model__overlap_channels": 6}, r"multiple of 4"),
+    ],
+)
+def test_a_wrong_configuration_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        read_settings(with_change(**changes))
+
+
+def test_a_missing_field_is_named():
+    config = with_change()
+    with config.unlocked():
+        del config.train["seed"]
+    with pytest.raises(ValueError, match=r"config must hold|config\.train .* lacks seed"):
+        read_settings(config)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--config=configs/cad.py", "--config.train.batchsize=4"], 'Did you mean "batch_size"'),
+        (["--config=configs/nothing.py"], "there is none at configs/nothing.py"),
+        (["--config=configs/modelnet.py", "--config.data.folder=/nowhere"], "none at /nowhere"),
+        (["--config=configs/threedmatch.py"], "Give --config.data.folder=PATH"),
+    ],
+    ids=["misspelt field", "no such configuration", "no such folder", "no folder given"],
+)
+def test_the_script_says_in_one_line_what_is_wrong(arguments, message, tmp_path):
+    done = train(*arguments, f"--run_dir={tmp_path / 'run'}")
+    assert done.returncode == 1
+    assert message in done.stderr and "Traceback" not in done.stderr
+    lines = [line for line in done.stderr.splitlines() if line.strip()]
+    assert lines[-1].startswith("error: "), done.stderr
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,146 @@
+"""The pairs that a configuration is tested on, and `evaluate.py` from the command line."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from configs import cad
+from dbdnet_jax import pair_sets
+from dbdnet_jax.data.frozen import cad_test_pairs
+from dbdnet_jax.data.modelnet40 import FILES, load_modelnet40
+from dbdnet_jax.evaluation import evaluate
+from dbdnet_jax.layout import parameter_shapes, unflatten
+from dbdnet_jax.model.config import ModelConfig
+from dbdnet_jax.model.params import Params
+from dbdnet_jax.pair_sets import load_test_pairs
+from dbdnet_jax.settings import Settings, read_settings
+from dbdnet_jax.weights import save_params
+from tests.data.test_modelnet40 import LABELS, write_file
+from tests.data.threedmatch_folder import write_folder
+
+ROOT = Path(__file__).parents[1]
+TINY = ModelConfig(
+    overlap_channels=4,
+    overlap_blocks=1,
+    registration_channels=4,
+    shared_blocks=1,
+    rotation_blocks=1,
+    translation_blocks=1,
+    neighbours=4,
+    neighbour_space="coordinates",
+)
+
+
+def tiny_params() -> Params:
+    """Small random weights: finite answers, no skill."""
+    rng = np.random.default_rng(0)
+    shapes = parameter_shapes(TINY)
+    arrays = {name: rng.normal(0, 0.2, shape) for name, shape in shapes.items()}
+    return unflatten({name: array.astype(np.float32) for name, array in arrays.items()}, TINY)
+
+
+def cad_settings(**fields) -> Settings:
+    config = cad.get_config()
+    config.update_from_flattened_dict({k.replace("__", "."): v for k, v in fields.items()})
+    return read_settings(config)
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess:
+    command = [sys.executable, "evaluate.py", "--config=configs/cad.py", *arguments]
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+
+
+@pytest.mark.parametrize(
+    ("fields", "variant"),
+    [
+        ({}, "noise"),
+        ({"protocol__noise_sigma": 0.0}, "clean"),
+        ({"protocol__disjoint": True}, "disjoint"),
+        ({"data__categories": "seen"}, "unseen"),
+    ],
+)
+def test_the_packages_frozen_sets_are_used_where_they_fit(fields, variant, tmp_path):
+    found = load_test_pairs(cad_settings(**fields), tmp_path)
+    pairs, digest = cad_test_pairs(variant)
+    assert (found.name, found.digest) == (f"cad_test_{variant}", digest)
+    assert np.array_equal(found.pairs.source.points, pairs.source.points)
+    assert not list(tmp_path.iterdir())
+
+
+def test_another_protocol_is_drawn_once_and_the_same_every_time(tmp_path, monkeypatch):
+    monkeypatch.setattr(pair_sets, "CAD_PAIRS", 4)
+    settings = cad_settings(protocol__points=64, data__categories="unseen")
+    first, again = (load_test_pairs(settings, tmp_path / name) for name in "ab")
+    assert first.name == "cad_test_seen" and first.digest == again.digest
+    assert first.pairs.source.points.shape == (4, 45, 3)
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["cad_test_seen.npz"]
+    clean = cad_settings(protocol__points=64, protocol__noise_sigma=0.0, data__categories="unseen")
+    assert load_test_pairs(clean, tmp_path / "a").digest != first.digest
+
+
+def test_modelnet40_has_one_pair_for_every_test_shape_of_the_other_half(tmp_path):
+    for split in FILES.values():
+        for seed, name in enumerate(split):
+            write_file(tmp_path / name, LABELS, seed)
+    settings = cad_settings(
+        data__name="modelnet40",
+        data__folder=str(tmp_path),
+        data__categories="seen",
+        protocol__points=16,
+    )
+    found = load_test_pairs(settings, tmp_path / "run")
+    assert found.name == "modelnet40_test_unseen"
+    assert len(found.pairs.source.count) == len(load_modelnet40(tmp_path, "test", "unseen")) == 4
+
+
+def test_scans_are_the_benchmarks_pairs_and_come_without_normals(tmp_path):
+    write_folder(tmp_path)
+    (tmp_path / "train.pkl").rename(tmp_path / "3DLoMatch.pkl")
+    settings = cad_settings(
+        data__name="threedmatch", data__folder=str(tmp_path), protocol__points=64
+    )
+    first, again = (load_test_pairs(settings, tmp_path / "run", "3DLoMatch") for _ in range(2))
+    assert first.name == "3DLoMatch" and first.digest == again.digest
+    assert first.pairs.source.points.shape == (3, 64, 3)
+    assert not first.pairs.source_normals.any()
+
+
+def test_params_without_a_registration_network_are_refused(tmp_path):
+    params = Params(overlap={}, registration=None, config=ModelConfig())
+    with pytest.raises(ValueError, match="needs a registration network.*--stage=registration"):
+        evaluate(cad_settings(), params, tmp_path, command="")
+
+
+def test_the_script_prints_the_table_and_writes_it(tmp_path):
+    save_params(tmp_path / "tiny.npz", tiny_params())
+    flags = f"--params={tmp_path}/tiny.npz", f"--run_dir={tmp_path}", "--config.protocol.points=128"
+    done = run(*flags, "--count=2")
+    assert done.returncode == 0, done.stderr
+    for method in ("identity", "ICP", "FGR, true normals", "DBDNet (untrained)", "DBDNet "):
+        assert f"\n{method}" in done.stdout
+    content = json.loads((tmp_path / "evaluation_cad_test_all_first_2.json").read_text())
+    assert content["pairs"] == 2 and content["pairs_hash"] in done.stdout
+    assert content["command"].startswith("python evaluate.py --config=configs/cad.py")
+    assert {row["method"] for row in content["rows"] if row["overlap_f1"] is not None} == {
+        "DBDNet", "DBDNet (untrained)", "all points overlapping (constant)",
+    }  # fmt: skip
+    assert (tmp_path / "evaluation_cad_test_all_first_2.csv").is_file()
+
+
+@pytest.mark.parametrize(
+    ("flag", "message"),
+    [
+        ("--params=nothing.npz", "nothing.npz"),
+        ("--params=unknown", "name must be one of the weights"),
+        ("--run_dir=no_such_run", "must hold a validated checkpoint; no_such_run has none"),
+        ("--config.protocol.point=3", "it has no"),
+    ],
+)
+def test_mistakes_are_one_line(flag, message):
+    done = run(flag)
+    lines = done.stderr.splitlines()
+    assert done.returncode == 1 and message in lines[-1] and "Traceback" not in done.stderr

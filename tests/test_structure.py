@@ -1,0 +1,168 @@
+"""The guards of the house: what may import what, and how long files and functions may be."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = "dbdnet_jax"
+MAX_FILE_LINES = 300
+MAX_FUNCTION_LINES = 60
+
+# A module may import only what stands above it; a new module finds its place here.
+ORDER = """
+types
+ops.rigid ops.sampling ops.grouping ops.attention ops.sinkhorn ops.pyramid
+model.config model.blocks model.edgeconv model.encoder model.overlap model.registration
+model.params model.dbdnet
+losses metrics recall
+safe_pickle torch_pickle
+data.shapes data.overlap data.pairs data.cad data.modelnet40 data.threedmatch data.frozen
+layout released weights checkpoint
+baselines.classical
+settings sources pair_sets parallel runlog stages training
+evaluation align report cli
+""".split()
+SCRIPTS = ("train", "evaluate")  # may import the package, not each other
+
+
+def module_name(path: Path, root: Path) -> str:
+    """``dbdnet_jax/ops/rigid.py`` is ``dbdnet_jax.ops.rigid``; a package is its folder."""
+    parts = path.relative_to(root).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imported_names(path: Path, root: Path) -> set[str]:
+    """Absolute dotted names of everything imported anywhere in a file, functions included."""
+    package = path.relative_to(root).parent.parts
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) + 1 - node.level] if node.level else ()
+            base = ".".join((*base, *((node.module,) if node.module else ())))
+            names |= {f"{base}.{alias.name}" for alias in node.names}
+    return names
+
+
+def rank(name: str) -> int | None:
+    """The place of an imported name; None for other libraries and for folders' ``__init__``."""
+    if name.split(".")[0] in SCRIPTS:
+        return len(ORDER)
+    if name.split(".")[0] != PACKAGE:
+        return None
+    inner = name.removeprefix(PACKAGE).lstrip(".")
+    for place, module in enumerate(ORDER):
+        if inner == module or inner.startswith(module + "."):
+            return place
+    folders = {module.split(".")[0] for module in ORDER if "." in module}
+    if inner in folders:
+        return None
+    return len(ORDER) - 1  # a public name: the package's own __init__, which imports everything
+
+
+def back_edges(root: Path) -> list[str]:
+    """Imports of what does not stand above the importing file, and files without a place."""
+    problems = []
+    paths = [root / f"{script}.py" for script in SCRIPTS] + sorted((root / PACKAGE).rglob("*.py"))
+    for path in (path for path in paths if path.exists()):
+        name = module_name(path, root)
+        if path.name == "__init__.py" and path.parent.name == PACKAGE:
+            continue
+        inner = name.removeprefix(PACKAGE + ".")
+        if path.name != "__init__.py" and inner not in (*ORDER, *SCRIPTS):
+            problems.append(f"{name} has no place in the import order; add it to ORDER")
+            continue
+        own = 0 if path.name == "__init__.py" else rank(name)
+        for imported in sorted(imported_names(path, root)):
+            place = rank(imported)
+            if place is not None and place >= own:
+                problems.append(f"{name} imports {imported}, which does not stand above it")
+    return problems
+
+
+def too_long(root: Path) -> list[str]:
+    """Files and functions above their limits, decorators not counted."""
+    problems = []
+    paths = [root / f"{script}.py" for script in SCRIPTS]
+    for folder in (PACKAGE, "configs", "tools", "tests", "benchmarks"):
+        paths += sorted((root / folder).rglob("*.py"))
+    for path in (path for path in paths if path.exists()):
+        text, name = path.read_text(), path.relative_to(root)
+        lines = len(text.splitlines())
+        if lines > MAX_FILE_LINES:
+            problems.append(f"{name} has {lines} lines, {MAX_FILE_LINES} are allowed")
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                lines = node.end_lineno - node.lineno + 1
+                if lines > MAX_FUNCTION_LINES:
+                    problems.append(
+                        f"{name}: {node.name} has {lines} lines, {MAX_FUNCTION_LINES} are allowed"
+                    )
+    return problems
+
+
+def test_every_file_imports_only_what_stands_above_it():
+    assert back_edges(ROOT) == []
+
+
+def test_no_file_and_no_function_is_too_long():
+    assert too_long(ROOT) == []
+
+
+def plant(root: Path, name: str, text: str) -> None:
+    path = root / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("dbdnet_jax/ops/rigid.py", "from dbdnet_jax.losses import focal\n"),
+        ("dbdnet_jax/ops/rigid.py", "from dbdnet_jax import losses\n"),
+        ("dbdnet_jax/ops/rigid.py", "import dbdnet_jax.losses as losses\n"),
+        ("dbdnet_jax/ops/rigid.py", "from ..losses import focal\n"),
+        ("dbdnet_jax/ops/rigid.py", "from .. import losses\n"),
+        ("dbdnet_jax/ops/rigid.py", "from dbdnet_jax.ops import sampling\n"),
+        ("dbdnet_jax/ops/rigid.py", "from . import sampling\n"),
+        ("dbdnet_jax/ops/rigid.py", "def lazy():\n    from dbdnet_jax.ops.rigid import a\n"),
+        ("dbdnet_jax/ops/rigid.py", "from dbdnet_jax import register\n"),
+        ("dbdnet_jax/ops/__init__.py", "from dbdnet_jax.ops.rigid import apply\n"),
+        ("dbdnet_jax/cli.py", "import train\n"),
+        ("dbdnet_jax/forgotten.py", ""),
+        ("train.py", "from evaluate import main\n"),
+    ],
+)
+def test_a_planted_back_edge_is_caught(tmp_path, name, text):
+    plant(tmp_path, name, text)
+    assert len(back_edges(tmp_path)) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("dbdnet_jax/__init__.py", "from dbdnet_jax.cli import main\n"),
+        ("dbdnet_jax/ops/rigid.py", "import jax\nfrom dbdnet_jax.types import Rigid\n"),
+        ("dbdnet_jax/model/blocks.py", "from ..ops import rigid\nfrom ..ops.rigid import apply\n"),
+        ("train.py", "from dbdnet_jax import register\nfrom dbdnet_jax.cli import main\n"),
+    ],
+)
+def test_an_import_of_what_stands_above_is_allowed(tmp_path, name, text):
+    plant(tmp_path, name, text)
+    assert back_edges(tmp_path) == []
+
+
+def test_a_planted_long_file_and_a_planted_long_function_are_caught(tmp_path):
+    plant(tmp_path, "dbdnet_jax/a.py", "x = 1\n" * (MAX_FILE_LINES + 1))
+    plant(tmp_path, "tests/b.py", "x = 1\n" * MAX_FILE_LINES)
+    body = "    x = 1\n" * MAX_FUNCTION_LINES
+    plant(tmp_path, "tests/c.py", "class C:\n" + f"  def long():\n{body}".replace("    ", "      "))
+    short = body.removesuffix("    x = 1\n")
+    plant(tmp_path, "train.py", f"@wraps(\n    f\n)\ndef short():\n{short}")
+    assert too_long(tmp_path) == [
+        f"dbdnet_jax/a.py has {MAX_FILE_LINES + 1} lines, {MAX_FILE_LINES} are allowed",
+        f"tests/c.py: long has {MAX_FUNCTION_LINES + 1} lines, {MAX_FUNCTION_LINES} are allowed",
+    ]

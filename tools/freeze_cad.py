@@ -1,0 +1,23 @@
+"""Draw the frozen test sets of the embedded CAD shapes; done once, the files are committed.
+
+python tools/freeze_cad.py
+"""
+
+from dbdnet_jax.data.cad import cad_split
+from dbdnet_jax.data.frozen import CAD_FOLDER, CAD_VARIANTS, freeze
+
+SEED = 2024
+PAIRS = 200
+
+
+def main() -> None:
+    """Write one file per variant and print its hash."""
+    CAD_FOLDER.mkdir(exist_ok=True)
+    for variant, (protocol, half) in CAD_VARIANTS.items():
+        path = CAD_FOLDER / f"cad_test_{variant}.npz"
+        digest = freeze(path, cad_split("test", half), protocol, seed=SEED, count=PAIRS)
+        print(f"{path.name}  sha256 {digest}")
+
+
+if __name__ == "__main__":
+    main()

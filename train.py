@@ -1,0 +1,63 @@
+"""Train DBDNet: the overlap network, then the registration network behind it.
+
+    python train.py --config=configs/cad_short.py
+    python train.py --config=configs/cad.py --config.train.batch_size=4 --run_dir=runs/mine
+
+A run that was stopped goes on when the same command is given again. The best weights end up in
+RUN_DIR/params.npz, the curves in RUN_DIR/STAGE/*.csv and, for TensorBoard, beside them.
+"""
+
+import os
+import shlex
+import sys
+from pathlib import Path
+
+import jax
+from absl import app, flags, logging
+from ml_collections import config_flags
+
+from dbdnet_jax.checkpoint import STAGES, load_best
+from dbdnet_jax.evaluation import evaluate
+from dbdnet_jax.report import render, save
+from dbdnet_jax.settings import parse_flags, read_settings
+from dbdnet_jax.sources import load_source
+from dbdnet_jax.training import fit
+from dbdnet_jax.weights import save_params
+
+CONFIG = config_flags.DEFINE_config_file("config", None, "Configuration file, configs/NAME.py.")
+RUN_DIR = flags.DEFINE_string("run_dir", None, "Where results go; runs/NAME if not given.")
+STAGE = flags.DEFINE_enum("stage", "both", [*STAGES, "both"], "What to train.")
+EVALUATE = flags.DEFINE_bool("evaluate", True, "Print the table of results at the end.")
+
+
+def main(argv: list[str]) -> None:
+    """Train the stages asked for, export the best weights, and score them."""
+    if argv[1:]:
+        raise app.UsageError(f"arguments must be flags such as --stage=both; got {argv[1:]}.")
+    logging.set_verbosity(logging.WARNING)  # Orbax tells a page about every checkpoint
+    config_file = config_flags.get_config_filename(flags.FLAGS["config"])
+    run_dir = Path(RUN_DIR.value or Path("runs") / Path(config_file).stem)
+    stages = STAGES if STAGE.value == "both" else (STAGE.value,)
+    try:
+        settings = read_settings(CONFIG.value)
+        # Before anything asks JAX for a device: the number is fixed from then on.
+        jax.config.update("jax_num_cpu_devices", settings.train.devices or os.cpu_count() or 1)
+        for stage in stages:
+            source = load_source(settings, getattr(settings, stage).batch_size)
+            fit(settings, stage, run_dir, source)
+        params = load_best(run_dir)
+        save_params(run_dir / "params.npz", params)
+        print(f"The best weights are in {run_dir / 'params.npz'}.")
+        if EVALUATE.value and params.registration is not None:
+            evaluation = evaluate(
+                settings, params, run_dir, command=shlex.join(["python", *sys.argv])
+            )
+            print(render(evaluation))
+            save(evaluation, run_dir)
+    except (ValueError, OSError, FloatingPointError) as error:
+        sys.exit(f"error: {error}")
+
+
+if __name__ == "__main__":
+    flags.mark_flag_as_required("config")
+    app.run(main, flags_parser=parse_flags)
