@@ -17,6 +17,9 @@ def get_config() -> ConfigDict:
     config.model.shared_blocks = 1
     config.model.rotation_blocks = 1
     config.model.translation_blocks = 1
+    config.model.heads = 2
+    config.model.head_width = 128  # twice the feature, as in the paper
+    config.model.parameter_width = 256
     config.model.neighbours = 16
     config.model.neighbour_space = "coordinates"  # one search per level instead of ten
     config.model.dropout = 0.0  # too small to overfit pairs that never repeat

@@ -16,25 +16,7 @@ from ml_collections import ConfigDict
 def get_config() -> ConfigDict:
     """Everything a run needs; the other configurations state their differences from this one."""
     config = ConfigDict()
-    config.model = ConfigDict(
-        {
-            "overlap_channels": 64,
-            "overlap_blocks": 4,
-            "registration_channels": 32,
-            "shared_blocks": 3,
-            "rotation_blocks": 3,
-            "translation_blocks": 3,
-            "heads": 4,
-            "dropout": 0.1,
-            "neighbours": 20,
-            "neighbour_space": "feature",
-            "overlap_threshold": 0.5,
-            "min_points": 160,
-            "iterations": 1,
-            "sinkhorn_iterations": 5,
-            "released": False,
-        }
-    )
+    config.model = _model()
     config.data = ConfigDict({"name": "modelnet40", "folder": "", "categories": "all"})
     config.protocol = ConfigDict(
         {
@@ -48,22 +30,7 @@ def get_config() -> ConfigDict:
             "overlap_radius": 0.1,
         }
     )
-    train = config.train = ConfigDict(
-        {
-            "seed": 0,
-            "batch_size": 8,
-            "learning_rate": 1e-4,
-            "weight_decay": 1e-4,
-            "warmup_epochs": 5.0,
-            "clip_norm": 0.0,  # 0: none
-            "ema_decay": 0.0,  # 0: none
-            "log_every": 20,
-            "validate_every": 1000,
-            "checkpoint_every": 200,
-            "validation_pairs": 200,
-            "devices": 0,  # on a CPU; 0: one for each core
-        }
-    )
+    train = config.train = _train()
     config.overlap = ConfigDict(
         {
             "epochs": 300.0,
@@ -87,3 +54,48 @@ def get_config() -> ConfigDict:
         }
     )
     return config.lock()
+
+
+def _model() -> ConfigDict:
+    """The released architecture."""
+    return ConfigDict(
+        {
+            "overlap_channels": 64,
+            "overlap_blocks": 4,
+            "registration_channels": 32,
+            "shared_blocks": 3,
+            "rotation_blocks": 3,
+            "translation_blocks": 3,
+            "heads": 4,
+            "dropout": 0.1,
+            "head_width": 512,
+            "parameter_width": 1024,
+            "neighbours": 20,
+            "neighbour_space": "feature",
+            "overlap_threshold": 0.5,
+            "min_points": 160,
+            "iterations": 1,
+            "sinkhorn_iterations": 5,
+            "released": False,
+        }
+    )
+
+
+def _train() -> ConfigDict:
+    """What both stages share."""
+    return ConfigDict(
+        {
+            "seed": 0,
+            "batch_size": 8,
+            "learning_rate": 1e-4,
+            "weight_decay": 1e-4,
+            "warmup_epochs": 5.0,
+            "clip_norm": 0.0,  # 0: none
+            "ema_decay": 0.0,  # 0: none
+            "log_every": 20,
+            "validate_every": 1000,
+            "checkpoint_every": 200,
+            "validation_pairs": 200,
+            "devices": 0,  # on a CPU; 0: one for each core
+        }
+    )

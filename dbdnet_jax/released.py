@@ -13,7 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dbdnet_jax.layout import (
+from dbdnet_jax.model.config import ModelConfig
+from dbdnet_jax.model.dbdnet import Params
+from dbdnet_jax.model.params import (
     NETWORKS,
     Shapes,
     flatten,
@@ -21,9 +23,6 @@ from dbdnet_jax.layout import (
     require_shapes,
     unflatten,
 )
-from dbdnet_jax.model.config import ModelConfig
-from dbdnet_jax.model.dbdnet import Params
-from dbdnet_jax.model.registration import GLOBAL_LAYERS
 from dbdnet_jax.safe_pickle import CheckpointError
 from dbdnet_jax.torch_pickle import load_torch
 
@@ -32,6 +31,10 @@ _OVERLAP = "overlap_predictor."
 _FULL = (_OVERLAP, "feature_extractor.", "RegNet.")
 # Declared beside the overlap network's blocks and used by none of its computations.
 _UNUSED = ("self_attention.", "self_layer_norm.", "cross_attention.", "cross_layer_norm.")
+_FIXED = {
+    name: getattr(ModelConfig(), name)
+    for name in ("neighbour_space", "heads", "head_width", "parameter_width")
+}
 _FIX = "Was it saved by the released code, and not altered since?"
 # Our names to theirs, in this order, before / becomes a dot.
 _RULES = (
@@ -39,7 +42,10 @@ _RULES = (
     (r"^registration/encoder/", "feature_extractor/"),
     (r"^registration/", "RegNet/"),
     (r"overlap_predictor/linear/", "overlap_predictor/linear/0/"),
-    (r"weight_net/linear/", f"weight_net/pre_parameter_layer/{3 * len(GLOBAL_LAYERS)}/"),
+    (
+        r"weight_net/linear/",
+        f"weight_net/pre_parameter_layer/{3 * len(ModelConfig().global_layers)}/",
+    ),
     (r"(stage\d_conv\d)/(conv|norm)_(\d)/", r"\1/conv/\3/\2/"),
     (r"(stage\d_(?:up|down)_\d_\d|neck_\d)/conv/", r"\1/conv/conv/"),
     (r"(attention|attention_R|attention_t|decoder)_(\d+)/", r"\1/\2/"),
@@ -115,12 +121,16 @@ def to_released(params: Params) -> dict[str, np.ndarray]:
         their code knows neither.
     """
     config = params.config
-    if params.overlap is None or config.neighbour_space != "feature":
+    if params.overlap is None:
         raise ValueError(
-            "The released code has an overlap network and searches neighbours among features; "
-            f"got overlap={'None' if params.overlap is None else 'present'}, "
-            f"neighbour_space={config.neighbour_space!r}. Train with neighbour_space='feature'."
+            "The released code always has an overlap network; got overlap=None. Train one first."
         )
+    for name, fixed in _FIXED.items():
+        if getattr(config, name) != fixed:
+            raise ValueError(
+                f"{name} is {fixed!r} in the released code and cannot be changed there; got "
+                f"{getattr(config, name)!r}. Train with {name}={fixed!r}."
+            )
     full = params.registration is not None
     ours = flatten(params)
     state = {}

@@ -13,7 +13,7 @@ class Cloud(NamedTuple):
     """A point cloud of static size; the valid points are the first ``count`` rows."""
 
     points: Float[Array, "n 3"]
-    count: Int[Array, ""]
+    count: Int[Array, ""]  # type: ignore[assignment]  # not tuple.count
 
 
 class Rigid(NamedTuple):

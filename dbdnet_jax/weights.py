@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from dbdnet_jax.layout import flatten, parameter_shapes, require_shapes, unflatten
 from dbdnet_jax.model.config import ModelConfig
 from dbdnet_jax.model.dbdnet import Params
+from dbdnet_jax.model.params import flatten, parameter_shapes, require_shapes, unflatten
 from dbdnet_jax.released import from_released, to_released
 from dbdnet_jax.safe_pickle import CheckpointError
 

@@ -13,9 +13,8 @@ from dbdnet_jax import pair_sets
 from dbdnet_jax.data.frozen import cad_test_pairs
 from dbdnet_jax.data.modelnet40 import FILES, load_modelnet40
 from dbdnet_jax.evaluation import evaluate
-from dbdnet_jax.layout import parameter_shapes, unflatten
 from dbdnet_jax.model.config import ModelConfig
-from dbdnet_jax.model.params import Params
+from dbdnet_jax.model.params import Params, parameter_shapes, unflatten
 from dbdnet_jax.pair_sets import load_test_pairs
 from dbdnet_jax.settings import Settings, read_settings
 from dbdnet_jax.weights import save_params

@@ -1,123 +1,47 @@
-"""The authors' code, run in float64, against ours: every intermediate, gradient and training step.
+"""The authors' networks, run in float64, against ours: every intermediate and both poses."""
 
-The file holds its large arrays rounded to float32, so they are compared to a millionth of their
-scale.
-"""
-
-import dataclasses
 import functools
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
-import pytest
 
-from configs import modelnet
-from dbdnet_jax.losses import LossWeights, registration_loss
 from dbdnet_jax.metrics import rotation_error_deg
 from dbdnet_jax.model.blocks import AttentionBlock, Exchange
 from dbdnet_jax.model.dbdnet import register, register_given_overlap, select
 from dbdnet_jax.model.edgeconv import EdgeConv
 from dbdnet_jax.model.encoder import Encoder
-from dbdnet_jax.model.params import Params
 from dbdnet_jax.model.registration import ParameterNetwork
 from dbdnet_jax.ops.attention import position_code
 from dbdnet_jax.ops.grouping import interpolation_weights
 from dbdnet_jax.ops.sampling import farthest_order, inverse_order
-from dbdnet_jax.parallel import on_all_devices
-from dbdnet_jax.released import from_released, to_released
-from dbdnet_jax.settings import read_settings
-from dbdnet_jax.stages import make_task
-from dbdnet_jax.training import init_state, make_optimizer, train_step
-from dbdnet_jax.types import Cloud, Pair, Rigid
+from dbdnet_jax.types import Cloud
 from tests.conftest import Tolerance, assert_close
-
-FILE = Path(__file__).parents[2] / "shared" / "golden" / "released_tiny.npz"
-pytestmark = pytest.mark.skipif(
-    not FILE.exists(), reason="outputs of the released code: a large file outside the repository"
+from tests.golden import (
+    CLOUDS,
+    MARKS,
+    NEIGHBOURS,
+    PAIRS,
+    POSE,
+    N,
+    below,
+    clouds,
+    golden,
+    released_params,
+    true_masks,
 )
 
-NEIGHBOURS = 8
-N = 320
-# Rounding to float32 stands between the file's numbers and ours, except for the poses.
-POSE = Tolerance(rtol=0.0, atol=1e-7)
-LOSS = Tolerance(rtol=1e-7, atol=0.0)
-# Biases in front of a normalisation have no gradient: rounding leaves about 1e-17.
-GRADIENT_NORM = Tolerance(rtol=1e-5, atol=1e-14)
-TRAJECTORY = Tolerance(rtol=1e-5, atol=0.0)
-# How far the released code's own float32 pose is from its float64 pose on these pairs, at most.
-RELEASED_FLOAT32_DEG = 6.9
-CLOUDS = ("source", "target")
-PAIRS = pytest.mark.parametrize("b", [0, 1])
+pytestmark = MARKS
 
-
-@pytest.fixture(scope="module", autouse=True)
-def double():
-    """Everything here is in float64."""
-    with jax.enable_x64(True):
-        yield
-
-
-@functools.cache
-def golden() -> dict[str, np.ndarray]:
-    """The file's arrays, widened to float64."""
-    arrays = dict(np.load(FILE))
-    return {k: x.astype(np.float64) if x.dtype.kind == "f" else x for k, x in arrays.items()}
-
-
-def below(prefix: str) -> dict[str, np.ndarray]:
-    """The arrays whose names start with ``prefix``, by the rest of their names."""
-    return {k.removeprefix(prefix): x for k, x in golden().items() if k.startswith(prefix)}
-
-
-def released_params(*, override: bool = False) -> Params:
-    """The released parameters in float64; ``override`` replaces the last overlap layer."""
-    state = below("state_dict/") | (below("end_to_end/override/") if override else {})
-    params = from_released(state, k=NEIGHBOURS)
-    return jax.tree.map(lambda x: x.astype(jnp.float64), params)
-
-
-def whole(points) -> Cloud:
-    """A cloud without padding."""
-    return Cloud(jnp.asarray(points), jnp.asarray(len(points)))
-
-
-def clouds(b: int) -> tuple[Cloud, Cloud]:
-    return whole(golden()["source"][b]), whole(golden()["target"][b])
-
-
-def true_masks(b: int) -> tuple[jax.Array, jax.Array]:
-    return jnp.asarray(golden()["source_mask_gt"][b]), jnp.asarray(golden()["target_mask_gt"][b])
-
-
-def pairs(*numbers: int) -> Pair:
-    """The pairs of these numbers, stacked."""
-    arrays, b = golden(), list(numbers)
-    count = jnp.full(len(b), N)
-    source, target = jnp.asarray(arrays["source"][b]), jnp.asarray(arrays["target"][b])
-    truth = jnp.asarray(arrays["rotation_gt"][b]), jnp.asarray(arrays["translation_gt"][b])
-    return Pair(
-        Cloud(source, count),
-        Cloud(target, count),
-        Rigid(*truth),
-        jnp.asarray(arrays["source_mask_gt"][b] > 0.5),
-        jnp.asarray(arrays["target_mask_gt"][b] > 0.5),
-        jnp.zeros_like(source),
-        jnp.zeros_like(target),
-    )
+register_whole = jax.jit(register)
+register_truly = jax.jit(register_given_overlap)
 
 
 def assert_same(actual, expected):
     """In float64, and equal to a millionth of the largest entry."""
     assert actual.dtype == np.float64
     assert_close(actual, expected, Tolerance(rtol=0.0, atol=1e-6 * np.abs(expected).max()))
-
-
-register_whole = jax.jit(register)
-register_truly = jax.jit(register_given_overlap)
 
 
 class Encoded(NamedTuple):
@@ -242,7 +166,7 @@ def test_registration_of_the_true_overlap(b):
         (answer.translation_branch, "correspondence_t"),
     ):
         assert_same(np.asarray(branch.correspondence)[block], expected[name])
-        assert_close(branch.correspondence.sum(), expected[name].sum(), TRAJECTORY)
+        assert np.sum(branch.correspondence > 0) == np.sum(expected[name] > 0)
     assert_close(answer.rotation, expected["rotation"], POSE)
     assert_close(answer.translation, expected["translation"], POSE)
 
@@ -271,84 +195,24 @@ def test_end_to_end(b):
     assert_close(answer.translation, expected["translation"], POSE)
 
 
-def test_loss_terms():
-    answer = register_truly(released_params(), *clouds(0), *true_masks(0))
-    pair = jax.tree.map(lambda x: x[0], pairs(0))
-    _, terms = registration_loss(answer, pair, LossWeights())
-    assert_close(jnp.stack(terms), golden()["registration/loss_terms_step0"], LOSS)
-
-
-@functools.cache
-def trained(stage: str, numbers: tuple[int, ...]) -> tuple[np.ndarray, Params]:
-    """Losses of five steps on these pairs, and the gradient of the first one."""
-    params = released_params()
-    # In evaluation mode, as there: no dropout.
-    model = dataclasses.replace(params.config, dropout=0.0)
-    settings = read_settings(modelnet.get_config())
-    given = dataclasses.replace(settings.registration, true_masks=True)
-    settings = dataclasses.replace(settings, model=model, registration=given)
-    task = make_task(settings, stage, "no folder is needed")
-    optimizer = optax.chain(
-        optax.trace(decay=0.0),  # keeps the gradient
-        make_optimizer(optax.constant_schedule(1e-3), weight_decay=settings.train.weight_decay),
-    )
-    step = jax.jit(
-        functools.partial(
-            train_step,
-            draw=lambda key, i, arrays: jax.tree.map(lambda x: x[i % len(numbers)], arrays),
-            loss=task.loss,
-            optimizer=optimizer,
-            batch_size=len(numbers),
-        )
-    )
-    state = on_all_devices(init_state(getattr(params, stage), optimizer))
-    key, arrays = on_all_devices((jax.random.key(0), pairs(*numbers)))
-    losses, gradient = [], None
-    for _ in range(5):
-        state, metrics = step(state, None, key, arrays)
-        losses.append(metrics.loss)
-        gradient = state.opt_state[0].trace if gradient is None else gradient
-    return np.stack(losses), dataclasses.replace(params, **{stage: gradient})
-
-
-STAGES = pytest.mark.parametrize(
-    ("stage", "numbers"), [("overlap", (0, 1)), ("registration", (0,))]
-)
-
-
-@STAGES
-def test_training(stage, numbers):
-    losses, _ = trained(stage, numbers)
-    assert losses.dtype == np.float64
-    assert_close(losses, golden()[f"{stage}/loss_trajectory"], TRAJECTORY)
-    assert_close(losses[0], golden()[f"{stage}/loss_trajectory"][0], LOSS)
-
-
-@STAGES
-def test_gradient_norms(stage, numbers):
-    _, gradient = trained(stage, numbers)
-    if stage == "overlap":
-        gradient = dataclasses.replace(gradient, registration=None)
-    by_name = to_released(gradient)
-    expected = below(f"{stage}/grad_norm/")
-    parameters = jax.tree.leaves(getattr(gradient, stage))
-    assert len(expected) == len(parameters)
-    names = list(expected)
-    found = np.stack([np.linalg.norm(by_name[name].astype(np.float64)) for name in names])
-    assert_close(found, np.stack([expected[name] for name in names]), GRADIENT_NORM)
-
-
 @PAIRS
 def test_float32_moves_no_further_than_theirs(b, record_property):
     """Neighbours flip on near-ties, so float32 agrees to degrees only, here as there."""
-    params = jax.tree.map(lambda x: np.asarray(x, np.float32), released_params())
-    masks = [np.float32(mask) for mask in true_masks(b)]
+    params = jax.tree.map(lambda x: np.asarray(x, np.float32), released_params(override=True))
     points = [np.float32(golden()[cloud][b]) for cloud in CLOUDS]
     with jax.enable_x64(False):
-        answer = register_truly(params, *map(whole, points), *masks)
+        answer = register_whole(params, *points)
     assert answer.rotation.dtype == np.float32
-    exact = golden()[f"registration/{b}/rotation"]
-    moved = rotation_error_deg(jnp.asarray(answer.rotation, jnp.float64), jnp.asarray(exact))
-    record_property("rotation_moved_deg", float(moved))
-    print(f"float32 moves the rotation of pair {b} by {float(moved):.4f} degrees")
-    assert moved <= RELEASED_FLOAT32_DEG
+    expected = below(f"end_to_end/{b}/")
+    moved_deg = rotation_error_deg(
+        jnp.asarray(answer.rotation, jnp.float64), jnp.asarray(expected["rotation"])
+    )
+    moved_probability = np.quantile(
+        np.abs(answer.src_overlap - expected["probability_source"]), 0.99
+    )
+    record_property("moved_deg", float(moved_deg))
+    record_property("moved_probability", float(moved_probability))
+    print(f"pair {b} in float32: {moved_deg:.5f} degrees, probabilities {moved_probability:.1e}")
+    # What the released code's own float32 does at most.
+    assert moved_deg <= 6.9
+    assert moved_probability <= 4e-3

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dbdnet_jax.layout import flatten, parameter_shapes, unflatten
 from dbdnet_jax.model.config import ModelConfig
+from dbdnet_jax.model.params import flatten, parameter_shapes, unflatten
 from dbdnet_jax.released import from_released, to_released
 from dbdnet_jax.safe_pickle import CheckpointError
 from tests.torch_files import save_stream, save_zip, tensor
@@ -191,7 +191,7 @@ def test_other_contents_are_refused(tmp_path, state):
 
 def test_what_their_code_cannot_run_is_not_written(state):
     params = from_released(state)
-    with pytest.raises(ValueError, match="neighbour_space='coordinates'"):
+    with pytest.raises(ValueError, match="neighbour_space is 'feature' .* got 'coordinates'"):
         to_released(params.replace(config=ModelConfig(neighbour_space="coordinates")))
     with pytest.raises(ValueError, match="overlap=None"):
         to_released(params.replace(overlap=None))

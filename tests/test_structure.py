@@ -14,12 +14,12 @@ MAX_FUNCTION_LINES = 60
 ORDER = """
 types
 ops.rigid ops.sampling ops.grouping ops.attention ops.sinkhorn ops.pyramid
-model.config model.blocks model.edgeconv model.encoder model.overlap model.registration
-model.params model.dbdnet
-losses metrics recall
 safe_pickle torch_pickle
+model.config model.params model.blocks model.edgeconv model.encoder model.overlap
+model.registration model.dbdnet
+losses metrics recall
 data.shapes data.overlap data.pairs data.cad data.modelnet40 data.threedmatch data.frozen
-layout released weights checkpoint
+released weights checkpoint
 baselines.classical
 settings sources pair_sets parallel runlog stages training
 evaluation align report cli

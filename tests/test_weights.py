@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from dbdnet_jax import weights
-from dbdnet_jax.layout import parameter_shapes, unflatten
 from dbdnet_jax.model.config import ModelConfig
+from dbdnet_jax.model.params import parameter_shapes, unflatten
 from dbdnet_jax.weights import CheckpointError, load_metadata, load_params, save_params
 from tests.torch_files import save_zip, tensor
 

@@ -92,9 +92,9 @@ def draw_recipe(key: PRNGKeyArray, points: Float[Array, "s 3"], protocol: Protoc
                 f"{2 * protocol.points}; got {total}. Lower points, or set disjoint=False."
             )
         order = jax.random.permutation(rows_key, total)
-        rows = order[: protocol.points], order[protocol.points : 2 * protocol.points]
+        rows = [order[: protocol.points], order[protocol.points : 2 * protocol.points]]
     else:
-        rows = tuple(resample(k, total, protocol.points) for k in jax.random.split(rows_key))
+        rows = [resample(k, total, protocol.points) for k in jax.random.split(rows_key)]
     cropped = [
         drawn[half_space_crop(points[drawn], random_direction(k), protocol.size)]
         for drawn, k in zip(rows, jax.random.split(crop_key), strict=True)

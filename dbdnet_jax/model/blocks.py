@@ -172,8 +172,8 @@ class AttentionBlock(nn.Module):
                 memory, memory_valid = features[::-1], valid[::-1]
             keys = None
             if dropout_key is not None:
-                dropout_key, *keys = jax.random.split(dropout_key, 3)
-                keys = jnp.stack(keys)
+                split = jax.random.split(dropout_key, 3)
+                dropout_key, keys = split[0], split[1:]
             features = norm(features + over_clouds(attend, features, memory, memory_valid, keys))
         return features
 

@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+Layers = tuple[tuple[int, int], ...]  # (features, groups of the norm) of each layer
+
 
 @dataclass(frozen=True)
 class ModelConfig:
@@ -19,6 +21,8 @@ class ModelConfig:
     translation_blocks: int = 3
     heads: int = 4
     dropout: float = 0.1  # of attention weights, in training only
+    head_width: int = 512  # of the overlap decoder's first layer
+    parameter_width: int = 1024  # of the parameter network's global feature
     neighbours: int = 20  # k of every neighbour search
     neighbour_space: str = "feature"  # or "coordinates": one search per level, shared
     overlap_threshold: float = 0.5
@@ -46,8 +50,31 @@ class ModelConfig:
                     f"heads must divide 4 * {name} = {4 * channels}; got {self.heads}. "
                     "Change one of the two."
                 )
+        for name in ("head_width", "parameter_width"):
+            if getattr(self, name) < 128 or getattr(self, name) % 128:
+                raise ValueError(
+                    f"{name} must be a positive multiple of 128 (its layers halve it, and their "
+                    f"group norms have up to 16 groups); got {getattr(self, name)}. Use 128."
+                )
         for name in ("neighbours", "min_points", "iterations", "sinkhorn_iterations", "heads"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}.")
         if not 0.0 <= self.dropout < 1.0:
             raise ValueError(f"dropout must be in [0, 1); got {self.dropout}.")
+
+    @property
+    def head_layers(self) -> Layers:
+        """The overlap decoder's layers."""
+        width = self.head_width
+        return (width, 8), (width // 2, 8), (width // 4, 4)
+
+    @property
+    def point_layers(self) -> Layers:
+        """The parameter network's layers for every point, before its maximum."""
+        return (64, 8), (64, 8), (64, 8), (128, 8), (self.parameter_width, 16)
+
+    @property
+    def global_layers(self) -> Layers:
+        """The parameter network's layers after its maximum."""
+        width = self.parameter_width
+        return (width // 2, 16), (width // 4, 16), (width // 8, 8)

@@ -125,7 +125,7 @@ def _overlap(params: Params, clouds: Cloud, dropout_key=None) -> Float[Array, "2
     """Overlap probabilities in the clouds' own row order."""
     ordered, order, skip_rows, _ = _prepare(clouds, params.config)
     network = OverlapNetwork(params.config)
-    logits = network.apply({"params": params.overlap}, ordered, skip_rows, dropout_key)
+    logits = jnp.asarray(network.apply({"params": params.overlap}, ordered, skip_rows, dropout_key))
     size = logits.shape[1]
     valid = jax.vmap(lambda count: prefix_mask(size, count))(clouds.count)
     logits = jnp.take_along_axis(logits, jax.vmap(inverse_order)(order), axis=1)
@@ -169,7 +169,8 @@ def _register(params, clouds, order, probability, sizes, dropout_key=None) -> Re
     identity = rigid.identity(motion.rotation.dtype)
     motion = jax.tree.map(lambda found, rest: jnp.where(solvable, found, rest), motion, identity)
     return Registration(
-        *motion,
+        rotation=motion.rotation,
+        translation=motion.translation,
         src_overlap=overlap[0, : sizes[0]],
         tgt_overlap=overlap[1, : sizes[1]],
         src_kept=rows < count[0],
@@ -199,7 +200,7 @@ def _iterate(params: Params, kept: Cloud, dropout_key):
         if features is None or not config.released:
             # Departure of the released code: features of the unmoved source serve all iterations.
             features = network.apply(variables, ordered, skip_rows, method="encode")
-        matrix = network.apply(variables, ordered, features, key, method="match")
+        matrix = jnp.asarray(network.apply(variables, ordered, features, key, method="match"))
         increment, targets, solvable = _solve(matrix, ordered, centroid, config)
         # The released code returns the last increment instead of the composed motion.
         total = rigid.compose(increment, motion)

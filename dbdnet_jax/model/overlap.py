@@ -13,8 +13,6 @@ from dbdnet_jax.ops.grouping import masked_max
 from dbdnet_jax.ops.sampling import prefix_mask
 from dbdnet_jax.types import Cloud
 
-HEAD = ((512, 8), (256, 8), (128, 4))  # (features, groups) of the decoder's layers
-
 
 class OverlapNetwork(nn.Module):
     """Overlap logits of both clouds (paper, section III-B)."""
@@ -50,7 +48,7 @@ class OverlapNetwork(nn.Module):
         pooled = jax.vmap(masked_max)(features, valid)[::-1]  # of the other cloud
         other = jnp.broadcast_to(pooled[:, None, :], features.shape)
         features = jnp.concatenate([features, other], axis=-1)
-        for layer, (size, groups) in enumerate(HEAD):
+        for layer, (size, groups) in enumerate(config.head_layers):
             decode = DenseNorm(size, groups, name=f"decoder_{layer}")
             features = over_clouds(decode, features, valid)
         return dense(Affine(1, name="linear"), features.reshape(2 * n, -1)).reshape(2, n)

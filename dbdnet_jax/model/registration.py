@@ -16,9 +16,6 @@ from dbdnet_jax.ops.sampling import prefix_mask
 from dbdnet_jax.ops.sinkhorn import sinkhorn
 from dbdnet_jax.types import Cloud
 
-POINT_LAYERS = ((64, 8), (64, 8), (64, 8), (128, 8), (1024, 16))  # (features, groups)
-GLOBAL_LAYERS = ((512, 16), (256, 16), (128, 8))
-
 
 class Affinity(NamedTuple):
     """How feature distances become affinities: ``-beta (distance^2 - alpha)``, per branch."""
@@ -32,6 +29,8 @@ class Affinity(NamedTuple):
 class ParameterNetwork(nn.Module):
     """A PointNet over both clouds, tagged 0 and 1, that sets the branches' affinities."""
 
+    config: ModelConfig
+
     @nn.compact
     def __call__(self, clouds: Cloud) -> Affinity:
         """Four positive numbers from two stacked clouds (RPM-Net, Yew & Lee 2020)."""
@@ -39,10 +38,10 @@ class ParameterNetwork(nn.Module):
         tag = jnp.zeros((2, n, 1), clouds.points.dtype).at[1].set(1.0)
         x = jnp.concatenate([clouds.points, tag], axis=-1).reshape(2 * n, 4)
         valid = jax.vmap(lambda count: prefix_mask(n, count))(clouds.count).reshape(2 * n)
-        for layer, (features, groups) in enumerate(POINT_LAYERS):
+        for layer, (features, groups) in enumerate(self.config.point_layers):
             x = DenseNorm(features, groups, name=f"point_{layer}")(x, valid)
         x = masked_max(x, valid)[None, :]
-        for layer, (features, groups) in enumerate(GLOBAL_LAYERS):
+        for layer, (features, groups) in enumerate(self.config.global_layers):
             x = DenseNorm(features, groups, name=f"global_{layer}")(x, jnp.ones(1, bool))
         x = nn.softplus(dense(Affine(4, name="linear"), x)[0])
         return Affinity(x[0], x[1], x[2], x[3])
@@ -59,7 +58,7 @@ class RegistrationNetwork(nn.Module):
         self.encoder = Encoder(
             config.registration_channels, config.neighbours, config.neighbour_space
         )
-        self.weight_net = ParameterNetwork()
+        self.weight_net = ParameterNetwork(config)
 
         def stack(size):
             return [AttentionBlock(config.heads, config.dropout) for _ in range(size)]

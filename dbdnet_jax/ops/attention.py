@@ -27,29 +27,29 @@ def attention(
     n, d = query.shape
     width = d // heads
     split = [x.reshape(x.shape[0], heads, width).swapaxes(0, 1) for x in (query, key, value)]
-    if dropout_key is None or dropout == 0.0:
-        out = jax.lax.map(jax.checkpoint(lambda qkv: _head(*qkv, valid)), tuple(split))
-    else:
-        keys = jax.random.split(dropout_key, heads)
-        out = jax.lax.map(
-            jax.checkpoint(lambda x: _head(*x[:3], valid, dropout=dropout, dropout_key=x[3])),
-            (*split, keys),
-        )
+    keys = None if dropout_key is None else jax.random.split(dropout_key, heads)
+
+    def head(arguments: tuple) -> jax.Array:
+        query, key, value, dropout_key = arguments
+        return _head(query, key, value, dropout_key, valid, dropout)
+
+    out = jax.lax.map(jax.checkpoint(head), (*split, keys))
     return out.swapaxes(0, 1).reshape(n, d)
 
 
-def _head(query, key, value, valid, *, dropout=0.0, dropout_key=None):
+def _head(query, key, value, dropout_key, valid, dropout):
     """One head: softmax(q k^T / sqrt(width)) v, with the division left to the n x width result."""
+    present = valid.astype(value.dtype)[:, None]
     logits = jnp.matmul(query * (1.0 / math.sqrt(query.shape[-1])), key.T)
-    # A large finite number, not -inf: a row of only -inf would give nan.
+    # A large finite number, not -inf: a row of only -inf would give nan. Such a row weighs all
+    # masked rows alike, so these are left out of both products below.
     logits = jnp.where(valid[None, :], logits, jnp.finfo(logits.dtype).min)
-    logits = logits - jax.lax.stop_gradient(jnp.max(logits, axis=-1, keepdims=True))
-    weights = jnp.where(valid[None, :], jnp.exp(logits), 0.0)
-    total = jnp.sum(weights, axis=-1, keepdims=True)
+    weights = jnp.exp(logits - jax.lax.stop_gradient(jnp.max(logits, axis=-1, keepdims=True)))
+    total = jnp.matmul(weights, present)
     if dropout_key is not None:
         kept = jax.random.bernoulli(dropout_key, 1.0 - dropout, weights.shape)
         weights = jnp.where(kept, weights / (1.0 - dropout), 0.0)
-    return jnp.matmul(weights, value) / jnp.where(total > 0, total, 1.0)
+    return jnp.matmul(weights, value * present) / jnp.where(total > 0, total, 1.0)
 
 
 def position_code(points: Float[Array, "n 3"], width: int) -> Float[Array, "n width"]:

@@ -20,7 +20,7 @@ class Level(NamedTuple):
     """One resolution: its points, and its neighbours among its own points in coordinates."""
 
     points: Float[Array, "n 3"]
-    count: Int[Array, ""]
+    count: Int[Array, ""]  # type: ignore[assignment]  # not tuple.count
     valid: Bool[Array, " n"]
     neighbours: Int[Array, "n k"]
 

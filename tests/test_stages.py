@@ -1,0 +1,112 @@
+"""Both stages with a tiny network, on shapes that the test makes."""
+
+import csv
+import itertools
+
+import jax
+import numpy as np
+import pytest
+
+from configs import cad
+from dbdnet_jax.checkpoint import Checkpoints, load_best
+from dbdnet_jax.safe_pickle import CheckpointError
+from dbdnet_jax.settings import Settings, read_settings
+from dbdnet_jax.sources import Source, shape_source
+from dbdnet_jax.training import fit
+from tests import stand_in
+from tests.conftest import EXACT, assert_close, assert_finite
+
+
+def settings() -> Settings:
+    """Six steps of two pairs for each stage."""
+    config = cad.get_config()
+    config.model.overlap_channels = config.model.registration_channels = 4
+    config.model.overlap_blocks = 1
+    config.model.heads = 2
+    config.model.neighbours = 4
+    config.model.min_points = 12
+    config.model.dropout = 0.1
+    config.protocol.points = 64
+    config.train.batch_size = 2
+    config.train.learning_rate = 3e-3
+    config.train.warmup_epochs = 0.0
+    config.train.ema_decay = 0.0
+    config.train.log_every = 2
+    config.train.checkpoint_every = 2
+    config.train.validate_every = 6
+    config.train.validation_pairs = 2
+    config.overlap.epochs = config.registration.epochs = 3.0
+    return read_settings(config)
+
+
+SETTINGS = settings()
+
+
+def source() -> Source:
+    """The same two pairs in every step, so that six steps show."""
+    shapes = stand_in.shapes(count=4, points=64)
+    pairs = shape_source(shapes, shapes, SETTINGS.protocol, seed=0, validation_pairs=2)
+    return pairs._replace(
+        draw=lambda key, number, arrays: pairs.draw(
+            jax.random.fold_in(jax.random.key(1), number % 2), number % 2, arrays
+        )
+    )
+
+
+def losses(folder) -> list[float]:
+    with (folder / "train.csv").open() as file:
+        return [float(row["loss"]) for row in csv.DictReader(file)]
+
+
+@pytest.fixture(scope="module")
+def run_dir(tmp_path_factory):
+    """A run of both stages."""
+    folder = tmp_path_factory.mktemp("run")
+    for stage in ("overlap", "registration"):
+        fit(SETTINGS, stage, folder, source())
+    return folder
+
+
+@pytest.mark.parametrize("stage", ["overlap", "registration"])
+def test_some_steps_lower_the_loss(run_dir, stage):
+    curve = losses(run_dir / stage)
+    assert len(curve) == 3 and curve[-1] < curve[0]
+
+
+def test_the_second_stage_leaves_the_first_one_alone(run_dir):
+    params = load_best(run_dir)
+    assert params.config == SETTINGS.model
+    assert_finite((params.overlap, params.registration))
+    with Checkpoints(run_dir / "overlap") as checkpoints:
+        trained = checkpoints.restore_weights(checkpoints.best_step())
+    jax.tree.map(lambda a, b: assert_close(a, b, EXACT), params.overlap, trained)
+
+
+@pytest.mark.parametrize("stage", ["overlap", "registration"])
+def test_a_stopped_run_ends_as_an_unbroken_one(run_dir, tmp_path, stage):
+    if stage == "registration":
+        (tmp_path / "overlap").symlink_to(run_dir / "overlap")
+    pairs = source()
+    stopping = pairs._replace(arrays=lambda start: itertools.islice(pairs.arrays(start), 3))
+    with pytest.raises(StopIteration):
+        fit(SETTINGS, stage, tmp_path, stopping)
+    fit(SETTINGS, stage, tmp_path, pairs)
+    found, expected = (getattr(load_best(folder), stage) for folder in (tmp_path, run_dir))
+    jax.tree.map(lambda a, b: assert_close(a, b, EXACT), found, expected)
+    for name in ("train.csv", "validation.csv"):
+        assert (tmp_path / stage / name).read_bytes() == (run_dir / stage / name).read_bytes()
+
+
+def test_a_shape_with_nan_stops_the_overlap_stage(tmp_path):
+    pairs = source()
+    points = np.array(next(pairs.arrays(0)))
+    points[:] = np.nan
+    with pytest.raises(FloatingPointError, match="'source_focal' is nan at step 1"):
+        fit(
+            SETTINGS, "overlap", tmp_path, pairs._replace(arrays=lambda _: itertools.repeat(points))
+        )
+
+
+def test_registration_needs_the_overlap_network(tmp_path):
+    with pytest.raises(CheckpointError, match="--stage=overlap or both"):
+        fit(SETTINGS, "registration", tmp_path, source())
