@@ -40,8 +40,11 @@ def main(argv: list[str]) -> None:
     stages = STAGES if STAGE.value == "both" else (STAGE.value,)
     try:
         settings = read_settings(CONFIG.value)
-        # Before anything asks JAX for a device: the number is fixed from then on.
-        jax.config.update("jax_num_cpu_devices", settings.train.devices or os.cpu_count() or 1)
+        # Before anything asks JAX for a device: the number is fixed from then on. More devices
+        # than pairs in a step would have nothing to do.
+        pairs = max(settings.overlap.batch_size, settings.registration.batch_size)
+        devices = settings.train.devices or min(os.cpu_count() or 1, pairs)
+        jax.config.update("jax_num_cpu_devices", devices)
         for stage in stages:
             source = load_source(settings, getattr(settings, stage).batch_size)
             fit(settings, stage, run_dir, source)
@@ -56,6 +59,8 @@ def main(argv: list[str]) -> None:
             save(evaluation, run_dir)
     except (ValueError, OSError, FloatingPointError) as error:
         sys.exit(f"error: {error}")
+    except KeyboardInterrupt:
+        sys.exit("Stopped. The same command goes on from the last checkpoint.")
 
 
 if __name__ == "__main__":

@@ -15,6 +15,6 @@ def get_config() -> ConfigDict:
     config.train.warmup_epochs = 0.25
     config.train.validate_every = 100
     config.train.checkpoint_every = 100
-    config.overlap.epochs = 2.0
-    config.registration.epochs = 4.0
+    config.overlap.epochs = 1.5
+    config.registration.epochs = 5.0
     return config

@@ -10,8 +10,7 @@ class RunLog:
     """Rows of scalars by step, in ``folder/NAME.csv`` and ``folder/tensorboard``.
 
     Opened at the step a run goes on from, it drops the rows after it: those steps are done again,
-    and the files end up as those of an unbroken run. What differs between two equal runs, such as
-    the time, goes to TensorBoard only.
+    and the files end up as those of an unbroken run.
     """
 
     def __init__(self, folder: Path, start: int):
@@ -35,10 +34,6 @@ class RunLog:
         row = ",".join([str(step), *map(repr, values.values())]) + "\n"
         with path.open("a") as file:
             file.write(head + row)
-        self.write_event(name, step, values)
-
-    def write_event(self, name: str, step: int, values: Mapping[str, float]) -> None:
-        """Show scalars in TensorBoard only."""
         for key, value in values.items():
             self._events.add_scalar(f"{name}/{key}", value, step)
         self._events.flush()

@@ -13,7 +13,7 @@ import math
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import flax.struct
 import jax
@@ -201,7 +201,7 @@ class _Loop:
         )
         arrays = _on_all_devices(self.source.arrays(start))
         validate = jax.jit(self._mean_validation)
-        window: list[StepMetrics] = []
+        window: list[dict[str, float]] = []
         waiting: list[StepMetrics] = []
         with self._bar(start) as bar:
             for done in range(start + 1, self.total + 1):
@@ -211,9 +211,8 @@ class _Loop:
                 # One step late, so that the device always has the next one to work on. A bad step
                 # gives back the state it was given, so the one after it did too.
                 while len(waiting) > (0 if at_row else 1):
-                    window.append(jax.device_get(waiting.pop(0)))
-                    if not window[-1].finite:
-                        self._stop(state, window[-1])
+                    window.append(_scalars(jax.device_get(waiting.pop(0))))
+                    self._require_finite(window[-1], state, "in the step")
                     bar.update(self.batch_size)
                 if not at_row:
                     continue
@@ -223,6 +222,7 @@ class _Loop:
                     weights = state.params if state.ema is None else state.ema
                     means = validate(weights, frozen, pairs)
                     row = {name: float(value) for name, value in means.items()}
+                    self._require_finite(row, state, "in the validation")
                     self.log.write("validation", done, row)
                     self.checkpoints.save(done, state, row["error"])
                 elif done % train.checkpoint_every == 0:
@@ -240,10 +240,9 @@ class _Loop:
             mininterval=0.5 if sys.stderr.isatty() else 30.0,
         )
 
-    def _write_row(self, done: int, window: list[StepMetrics]) -> dict[str, str]:
+    def _write_row(self, done: int, window: list[dict[str, float]]) -> dict[str, str]:
         """Log the means over the steps since the last row; returns what the bar shows."""
-        columns = [_scalars(metrics) for metrics in window]
-        row = {name: sum(c[name] for c in columns) / len(columns) for name in columns[0]}
+        row = {name: sum(step[name] for step in window) / len(window) for name in window[0]}
         row["learning_rate"] = float(self.schedule(done - 1))
         self.log.write("train", done, row)
         return {"loss": f"{row['loss']:.4f}"}
@@ -256,20 +255,20 @@ class _Loop:
         count = pairs.source.count.shape[0]
         return mean_over_pairs(one, count, weights, frozen, pairs)
 
-    def _stop(self, state: TrainState, metrics: StepMetrics) -> NoReturn:
-        """Keep the last good state and say what went wrong."""
-        good = int(state.step)
-        name, value = next(
-            (name, value) for name, value in _scalars(metrics).items() if not math.isfinite(value)
-        )
+    def _require_finite(self, scalars: dict[str, float], state: TrainState, where: str) -> None:
+        """Stop at the first value that is not finite, with the last good state on disk."""
+        bad = [name for name, value in scalars.items() if not math.isfinite(value)]
+        if not bad:
+            return
+        good, folder = int(state.step), self.checkpoints.folder
         if good and self.checkpoints.latest_step() != good:
             self.checkpoints.save(good, state)
-        where = self.checkpoints.folder / str(good) if good else "nowhere: it was the first step"
         raise FloatingPointError(
-            f"every loss term and gradient must be finite; '{name}' is {value} at step {good + 1} "
-            f"of {self.checkpoints.folder.parent}. The last good state is kept: {where}. Look for "
-            "NaN or huge values in the data, mend it and start the same command again; if the data "
-            "is sound, train anew with a lower learning rate or config.train.clip_norm=1.0."
+            f"every loss term and gradient must be finite; '{bad[0]}' is {scalars[bad[0]]} {where} "
+            f"after step {good} of {folder.parent}. The last good state is kept: "
+            f"{folder / str(good) if good else 'none, it was the first step'}. Look for NaN or "
+            "huge values in the data, mend it and start the same command again; if the data is "
+            "sound, train anew with a lower learning rate or --config.train.clip_norm=1.0."
         )
 
 

@@ -147,8 +147,11 @@ def test_affinity_parameters(b):
     rows = [golden()[cloud][b][golden()[f"registration/{b}/{cloud}_index"]] for cloud in CLOUDS]
     points = np.stack([np.vstack([x, np.zeros((N - len(x), 3))]) for x in rows])
     both = Cloud(jnp.asarray(points), jnp.asarray([len(x) for x in rows]))
-    variables = {"params": released_params().registration["weight_net"]}
-    beta_r, alpha_r, beta_t, alpha_t = jax.jit(ParameterNetwork().apply)(variables, both)
+    params = released_params()
+    variables = {"params": params.registration["weight_net"]}
+    beta_r, alpha_r, beta_t, alpha_t = jax.jit(ParameterNetwork(params.config).apply)(
+        variables, both
+    )
     found = jnp.stack([beta_r, alpha_r, beta_t, alpha_t])
     assert_same(found, golden()[f"registration/{b}/parameters"])
 

@@ -63,7 +63,7 @@ def test_a_run_leaves_its_curves_and_lowers_the_loss(unbroken):
     assert step == int(state.step) == STEPS
     rows = np.genfromtxt(unbroken / "train.csv", delimiter=",", names=True)
     assert rows.dtype.names == ("step", "fit", "size", "loss", "gradient_norm", "learning_rate")
-    assert list(rows["step"]) == [2, 4, 6, 8, 10, 12]
+    assert list(rows["step"]) == list(range(1, STEPS + 1))
     np.testing.assert_allclose(rows["fit"] + rows["size"], rows["loss"], rtol=1e-6)
     validation = np.genfromtxt(unbroken / "validation.csv", delimiter=",", names=True)
     assert list(validation["step"]) == [4, 8, 12]
@@ -100,7 +100,7 @@ def test_a_run_killed_again_and_again_ends_as_an_unbroken_one(unbroken, tmp_path
     command = [sys.executable, "-m", "tests.stand_in", str(tmp_path)]
     options = {"cwd": Path(__file__).parents[1], "env": {**os.environ, "JAX_PLATFORMS": "cpu"}}
     log = tmp_path / "train.csv"
-    for rows in (2, 4):
+    for rows in (3, 8):
         child = subprocess.Popen([*command, "0.1"], stderr=subprocess.DEVNULL, **options)
         deadline = time.monotonic() + 120
         while not log.exists() or log.read_text().count("\n") < 1 + rows:
@@ -126,7 +126,7 @@ def broken_source(bad: int):
 
 @pytest.mark.parametrize("bad_step", [0, 6, 7])
 def test_nan_in_the_data_stops_with_the_last_good_state(unbroken, tmp_path, bad_step):
-    message = rf"'fit' is nan at step {bad_step + 1} of .* kept: .*{bad_step or 'nowhere'}"
+    message = rf"'fit' is nan in the step after step {bad_step} .* kept: .*{bad_step or 'none'}"
     with pytest.raises(FloatingPointError, match=message):
         stand_in.train(tmp_path, broken_source(bad_step * stand_in.BATCH + 2))
     with Checkpoints(tmp_path) as checkpoints:
@@ -146,8 +146,18 @@ def test_a_gradient_that_is_not_finite_is_named_too(tmp_path):
     task = stand_in.task()._replace(loss=loss)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stand_in, "task", lambda: task)
-        with pytest.raises(FloatingPointError, match="'gradient_norm' is nan at step 1"):
+        with pytest.raises(FloatingPointError, match="'gradient_norm' is nan in the step"):
             stand_in.train(tmp_path)
+
+
+def test_a_validation_that_is_not_finite_stops_too(tmp_path):
+    validation = stand_in.source().validation
+    points = validation.target.points.at[1].set(jnp.inf)
+    validation = validation._replace(target=validation.target._replace(points=points))
+    with pytest.raises(FloatingPointError, match="'error' is .* in the validation after step 4"):
+        stand_in.train(tmp_path, stand_in.source()._replace(validation=validation))
+    with Checkpoints(tmp_path) as checkpoints:
+        assert checkpoints.latest_step() == 4 and checkpoints.best_step() is None
 
 
 def step_once(batch_size: int, ema_decay: float = 0.0, bad: int = -1):
@@ -179,15 +189,16 @@ def test_a_step_takes_the_mean_gradient_of_its_pairs(batch_size):
     pairs, task = stand_in.source(), stand_in.task()
     key = jax.random.fold_in(jax.random.key(0), 3)
     points = jnp.asarray(next(pairs.arrays(0)))
-    losses, gradients = [], []
-    for i in range(batch_size):
+
+    @jax.jit
+    def one(i):
         draw_key, loss_key = jax.random.split(jax.random.fold_in(key, i))
-        pair = pairs.draw(draw_key, jnp.asarray(3 * batch_size + i), points)
-        (loss, _), gradient = jax.value_and_grad(task.loss, has_aux=True)(
-            task.trainable, None, pair, loss_key
-        )
-        losses.append(loss)
-        gradients.append(gradient)
+        pair = pairs.draw(draw_key, 3 * batch_size + i, points)
+        return jax.value_and_grad(task.loss, has_aux=True)(task.trainable, None, pair, loss_key)
+
+    found = [one(i) for i in range(batch_size)]
+    losses = [loss for (loss, _), _ in found]
+    gradients = [gradient for _, gradient in found]
     expected = jax.tree.map(lambda *leaves: sum(leaves) / batch_size, *gradients)
     assert_close(metrics.loss, np.mean(losses), FLOAT32)
     assert_close(metrics.gradient_norm, optax.tree.norm(expected), FLOAT32)
@@ -209,8 +220,10 @@ def test_the_average_has_a_short_memory_at_first():
     jax.tree.map(lambda a, b: assert_close(a, b, FLOAT32), new.ema, expected)
 
 
+@pytest.mark.parametrize("backend", ["cpu", "gpu"])
 @pytest.mark.parametrize("count", [1, 2, 3, 8])
-def test_mean_over_pairs_is_the_mean_on_any_number_of_devices(count):
+def test_mean_over_pairs_is_the_mean_on_any_hardware(monkeypatch, backend, count):
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
     offset = jnp.asarray([0.5, -1.0])
 
     def function(i, offset):
