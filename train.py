@@ -51,7 +51,7 @@ def main(argv: list[str]) -> None:
         params = load_best(run_dir)
         save_params(run_dir / "params.npz", params)
         print(f"The best weights are in {run_dir / 'params.npz'}.")
-        if EVALUATE.value and params.registration is not None:
+        if EVALUATE.value and None not in (params.overlap, params.registration):
             evaluation = evaluate(
                 settings, params, run_dir, command=shlex.join(["python", *sys.argv])
             )

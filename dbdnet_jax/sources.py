@@ -81,7 +81,16 @@ def load_training_shapes(data: DataSettings) -> tuple[Shapes, Shapes]:
 def shape_source(
     train: Shapes, validation: Shapes, protocol: Protocol, *, seed: int, validation_pairs: int
 ) -> Source:
-    """Pairs drawn on the device; every epoch sees every shape once, in an order of its own."""
+    """Pairs drawn on the device; every epoch sees every shape once, in an order of its own.
+
+    Raises:
+        ValueError: no shape to train or to validate on.
+    """
+    if not len(train) or not len(validation):
+        raise ValueError(
+            "training and validation need at least one shape each; got "
+            f"{len(train)} and {len(validation)}. Choose other config.data.categories."
+        )
     count = len(train)
     order_key = jax.random.key(seed)
 

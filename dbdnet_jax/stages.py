@@ -56,12 +56,12 @@ def make_task(settings: Settings, stage: str, run_dir: str | Path) -> Task:
 
 
 def _trained_overlap(model: ModelConfig, run_dir: str | Path) -> Any:
-    if not (Path(run_dir) / "overlap").is_dir():
+    params = load_best(run_dir) if (Path(run_dir) / "overlap").is_dir() else None
+    if params is None or params.overlap is None:
         raise CheckpointError(
             f"the registration stage needs a trained overlap network; {run_dir} has none. Train "
             "it first (--stage=overlap or both), or set config.registration.true_masks=True."
         )
-    params = load_best(run_dir)
     if params.config != model:
         raise CheckpointError(
             f"both networks of a run must be of one configuration; the overlap network in "

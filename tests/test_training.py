@@ -1,6 +1,5 @@
 """The step and the loop: the same result however often a run is stopped, and no bad state kept."""
 
-import dataclasses
 import os
 import signal
 import subprocess
@@ -233,22 +232,6 @@ def test_mean_over_pairs_is_the_mean_on_any_hardware(monkeypatch, backend, count
     expected = np.mean([np.sin(i) + np.asarray(offset) for i in range(count)], axis=0)
     assert_close(found["a"], expected, FLOAT32)
     assert_close(found["b"], 1.0, EXACT)
-
-
-def test_every_epoch_sees_every_shape_once():
-    train = stand_in.shapes()
-    train.points[:] = np.arange(len(train))[:, None, None]  # all points of shape i are (i, i, i)
-    still = dataclasses.replace(
-        stand_in.PROTOCOL, noise_sigma=0.0, max_angle_deg=0.0, max_translation=0.0
-    )
-    pairs = stand_in.shape_source(train, train, still, seed=1, validation_pairs=20)
-    points, key = jnp.asarray(next(pairs.arrays(0))), jax.random.key(0)
-    draw = jax.jit(lambda number: pairs.draw(key, number, points).target.points[0, 0])
-    seen = [int(draw(number)) for number in range(24)]
-    epochs = np.reshape(seen, (3, 8))
-    assert (np.sort(epochs, axis=1) == np.arange(8)).all()
-    assert len({tuple(epoch) for epoch in epochs}) == 3
-    assert list(pairs.validation.target.points[:, 0, 0].astype(int)) == [i % 8 for i in range(20)]
 
 
 def test_the_schedule_warms_up_to_the_peak_and_ends_at_zero():

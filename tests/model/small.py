@@ -9,7 +9,7 @@ import numpy as np
 from dbdnet_jax.model.config import ModelConfig
 from dbdnet_jax.model.params import Params, init_params
 from dbdnet_jax.types import Cloud
-from tests.conftest import Tolerance
+from tests.conftest import GRADIENT, Tolerance, assert_close, random_cloud
 
 SMALL = ModelConfig(
     overlap_channels=4,
@@ -32,16 +32,19 @@ compiled = functools.partial(jax.jit, compiler_options={"xla_backend_optimizatio
 
 
 def perturbed(variables, seed: int):
-    """Parameters moved off their initial values in float64: none is zero, one or like another."""
+    """Float64 NumPy parameters off their initial values: none is zero, one or like another."""
     rng = np.random.default_rng(seed)
-    return jax.tree.map(
-        lambda x: jnp.asarray(np.asarray(x, np.float64) + 0.2 * rng.normal(size=x.shape)), variables
-    )
+    return jax.tree.map(lambda x: np.float64(x) + 0.2 * rng.normal(size=x.shape), variables)
 
 
-def small_params(seed: int = 0, config: ModelConfig = SMALL) -> Params:
-    """Parameters of both networks in float64 (needs x64)."""
-    return perturbed(init_params(jax.random.key(seed), config), seed)
+def cast(tree, dtype):
+    """All leaves as JAX arrays of ``dtype``."""
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype), tree)
+
+
+def small_params(seed: int = 0, config: ModelConfig = SMALL, dtype=np.float64) -> Params:
+    """Parameters of both networks (float64 needs x64)."""
+    return cast(perturbed(init_params(jax.random.key(seed), config), seed), dtype)
 
 
 def whole(points) -> Cloud:
@@ -53,3 +56,22 @@ def padded(points, size: int, garbage: float) -> Cloud:
     """A cloud of ``size`` rows, ``garbage`` in those after ``points``."""
     rest = np.full((size - len(points), points.shape[1]), garbage)
     return Cloud(jnp.asarray(np.vstack([points, rest])), jnp.asarray(len(points)))
+
+
+def assert_same_derivative(function, plain, inputs):
+    """The derivative of ``function`` is that of central differences of ``plain`` (needs x64)."""
+    cotangent = random_cloud(20, plain(*inputs).size, 1).reshape(plain(*inputs).shape)
+    gradients = jax.grad(lambda *x: jnp.sum(function(*x) * cotangent), range(len(inputs)))(
+        *cast(inputs, np.float64)
+    )
+    for number, (x, gradient) in enumerate(zip(inputs, gradients, strict=True)):
+        for seed in (21, 22):
+            direction = random_cloud(seed, x.size, 1).reshape(x.shape)
+            ends = [
+                np.sum(
+                    plain(*inputs[:number], x + step * direction, *inputs[number + 1 :]) * cotangent
+                )
+                for step in (1e-6, -1e-6)
+            ]
+            slope = (ends[0] - ends[1]) / 2e-6
+            assert_close(jnp.sum(gradient * direction), slope, GRADIENT)

@@ -9,7 +9,7 @@ from dbdnet_jax.model.blocks import AttentionBlock, DenseNorm, Exchange
 from dbdnet_jax.ops.grouping import interpolation_weights, knn
 from tests import oracle
 from tests.conftest import Tolerance, assert_close, assert_finite, check_gradients, random_cloud
-from tests.model.small import perturbed
+from tests.model.small import assert_same_derivative, cast, perturbed
 
 N, COUNT = 20, 14
 # Inputs about 1000 in float32, whose spacing there is 6e-5, normalised to about 1.
@@ -29,10 +29,6 @@ def norm(seed: int, width: int) -> dict[str, np.ndarray]:
         "scale": random_cloud(seed, width, 1)[:, 0],
         "bias": random_cloud(seed + 1, width, 1)[:, 0],
     }
-
-
-def cast(tree, dtype):
-    return jax.tree.map(lambda x: jnp.asarray(x, dtype), tree)
 
 
 DENSE_NORM = {"conv": affine(0, 5, 8), "norm": norm(2, 8)}
@@ -77,7 +73,7 @@ def test_dense_norm_of_no_rows_and_of_equal_rows_is_finite(degenerate):
 
 
 def test_the_derivative_of_dense_norm_is_that_of_finite_differences(x64):
-    valid = np.arange(N) < COUNT
+    valid = jnp.arange(N) < COUNT
     layer = cast(DENSE_NORM, np.float64)
 
     def total(x, kernel, scale):
@@ -99,7 +95,8 @@ def test_transition_down_is_the_oracles_with_its_derivative(precision):
 
     @jax.jit
     def pool(x, kernel, bias):
-        index = knn(points[:kept], points, 5, N)
+        cloud = jnp.asarray(points)
+        index = knn(cloud[:kept], cloud, 5, jnp.asarray(N))
         variables = {"params": {"conv": {"kernel": kernel, "bias": bias}}}
         return Exchange(8).apply(variables, x, index, method="pool")
 
@@ -169,7 +166,7 @@ def test_an_attention_block_is_the_oracles_over_the_valid_rows(block, precision)
         {"params": variables}, jnp.asarray(features, precision.dtype), valid
     )
     assert found.dtype == precision.dtype
-    expected = attention_block_oracle(cast(variables, np.float64), features, valid, 2)
+    expected = attention_block_oracle(jax.tree.map(np.float64, variables), features, valid, 2)
     # The LayerNorm of rows about 1 follows sums of products about 10.
     tolerance = Tolerance(10 * precision.tolerance.rtol, 10 * precision.tolerance.atol)
     assert_close(np.asarray(found)[valid], expected[valid], tolerance)
@@ -191,22 +188,3 @@ def test_dropout_needs_a_key_and_is_decided_by_it(x64):
     for cloud in range(2):
         assert not np.allclose(first[cloud], other[cloud])
         assert not np.allclose(first[cloud], plain[cloud])
-
-
-def assert_same_derivative(function, plain, inputs):
-    """Along random directions, central differences of the plain form (needs x64)."""
-    cotangent = random_cloud(20, plain(*inputs).size, 1).reshape(plain(*inputs).shape)
-    gradients = jax.grad(lambda *x: jnp.sum(function(*x) * cotangent), range(len(inputs)))(
-        *cast(inputs, np.float64)
-    )
-    for number, (x, gradient) in enumerate(zip(inputs, gradients, strict=True)):
-        for seed in (21, 22):
-            direction = random_cloud(seed, x.size, 1).reshape(x.shape)
-            ends = [
-                np.sum(
-                    plain(*inputs[:number], x + step * direction, *inputs[number + 1 :]) * cotangent
-                )
-                for step in (1e-6, -1e-6)
-            ]
-            slope = (ends[0] - ends[1]) / 2e-6
-            assert_close(jnp.sum(gradient * direction), slope, Tolerance(1e-6, 1e-6))
