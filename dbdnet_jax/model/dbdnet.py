@@ -24,7 +24,8 @@ def register(
     """Register ``src`` to ``tgt``: no ground truth, no randomness, one static shape.
 
     Masks say which rows are points (all, if None); what stands in the other rows never matters.
-    Pure, so `jax.jit`, `jax.vmap` and `jax.grad` with respect to the clouds apply. Coordinates are
+    Pure, so `jax.jit`, `jax.vmap` and `jax.grad` with respect to the clouds apply (the derivative
+    takes neighbours, sampling, selection and interpolation weights as given). Coordinates are
     expected at the scale the weights were trained at (the unit sphere for the CAD and ModelNet40
     weights). Where nothing can be estimated ``valid`` is False and the motion the identity.
     """

@@ -1,7 +1,5 @@
 """A network small enough for tests, parameters that hide nothing, and clouds to feed it."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -26,9 +24,6 @@ SMALL = ModelConfig(
 
 # Reordered sums of a whole network in float64: a hundred layers carry and stretch the rounding.
 NETWORK = Tolerance(rtol=1e-7, atol=1e-8)
-
-# Compiling is most of these tests' time: without the optimisation of machine code, two thirds.
-compiled = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
 def perturbed(variables, seed: int):

@@ -8,11 +8,11 @@ import pytest
 from dbdnet_jax.model.dbdnet import register
 from dbdnet_jax.types import Registration
 from tests.conftest import EXACT, assert_close, random_cloud
-from tests.model.small import NETWORK, compiled, small_params
+from tests.model.small import NETWORK, small_params
 
 N = 40
-alone = compiled(register)
-batch = compiled(jax.vmap(register, in_axes=(None, 0, 0, 0, 0)))
+alone = jax.jit(register)
+batch = jax.jit(jax.vmap(register, in_axes=(None, 0, 0, 0, 0)))
 
 
 def stacked(*seeds: int):

@@ -10,14 +10,14 @@ from dbdnet_jax.model.dbdnet import register, select
 from dbdnet_jax.model.params import parameter_shapes
 from dbdnet_jax.types import Branch, Registration
 from tests.conftest import EXACT, assert_close, random_cloud
-from tests.model.small import NETWORK, cast, compiled, small_params
+from tests.model.small import NETWORK, cast, small_params
 
 N, COUNT, M = 64, 52, 49
 SOURCE, TARGET = random_cloud(0, COUNT), random_cloud(1, M)
 traces = []
 
 
-@compiled
+@jax.jit
 def register_counted(*arguments):
     """`register`, leaving a mark whenever it is traced."""
     traces.append(1)
@@ -78,7 +78,7 @@ def params(request, x64):
 @pytest.fixture
 def answer(params):
     """What they say of both clouds, without padding or masks."""
-    answer = compiled(register)(params, jnp.asarray(SOURCE), jnp.asarray(TARGET))
+    answer = jax.jit(register)(params, jnp.asarray(SOURCE), jnp.asarray(TARGET))
     assert answer.valid
     assert np.linalg.norm(answer.rotation - np.eye(3)) > 0.1
     return answer

@@ -8,7 +8,7 @@ import pytest
 from dbdnet_jax.model.encoder import Encoder
 from tests import oracle
 from tests.conftest import assert_close, random_cloud
-from tests.model.small import NETWORK, SMALL, compiled, padded, small_params, whole
+from tests.model.small import NETWORK, SMALL, padded, small_params, whole
 
 N = 40
 CHANNELS, K = SMALL.overlap_channels, SMALL.neighbours
@@ -23,7 +23,7 @@ def encode_eagerly(params, cloud, skip_rows=None, space: str = "feature"):
     return Encoder(CHANNELS, K, space).apply({"params": params}, cloud, skip_rows)
 
 
-encode = compiled(encode_eagerly, static_argnums=3)
+encode = jax.jit(encode_eagerly, static_argnums=3)
 
 
 def rectified(layer, x):
