@@ -1,6 +1,9 @@
 """A network that a CPU can train, on the CAD shapes inside the package.
 
-python train.py --config=configs/cad.py
+    python train.py --config=configs/cad.py
+
+100 + 100 epochs of 642 shapes; about 2 CPU-seconds a step of 8 pairs, so some ten hours on two
+cores. Not yet run to the end: no expected figures.
 """
 
 from ml_collections import ConfigDict

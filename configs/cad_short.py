@@ -1,6 +1,10 @@
 """A first look: the CAD configuration trained for a few minutes on two cores.
 
-python train.py --config=configs/cad_short.py
+    python train.py --config=configs/cad_short.py
+
+About 20 minutes of CPU time with compilation and the table. Ends at a mean rotation error of 28.6
+degrees and a mean translation error of 0.449 (untrained 33.8 / 0.535, identity 42.6 / 0.967). The
+overlap network has not learned more than "all points overlap" by then, and the table says so.
 """
 
 from ml_collections import ConfigDict
@@ -16,5 +20,5 @@ def get_config() -> ConfigDict:
     config.train.validate_every = 100
     config.train.checkpoint_every = 100
     config.overlap.epochs = 1.5
-    config.registration.epochs = 5.0
+    config.registration.epochs = 4.0
     return config

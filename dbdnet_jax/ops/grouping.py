@@ -72,5 +72,8 @@ def max_over_neighbours(
 def masked_max(features: Float[Array, "n c"], valid: Bool[Array, " n"]) -> Float[Array, " c"]:
     """Channel-wise maximum over the valid rows; zeros where no row is valid."""
     lowest = jnp.finfo(features.dtype).min
-    best = jnp.max(jnp.where(valid[:, None], features, lowest), axis=0)
+    # By index: the derivative of `jnp.max` looks for entries equal to the maximum, and loses its
+    # way where the compiler computes the features twice and rounds them differently.
+    row = jnp.argmax(jnp.where(valid[:, None], features, lowest), axis=0)
+    best = jnp.take_along_axis(features, row[None, :], axis=0)[0]
     return jnp.where(jnp.any(valid), best, 0.0)
