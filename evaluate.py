@@ -5,8 +5,9 @@
     python evaluate.py --config=configs/cad.py --params=mine.npz
 
 The configuration's data set and protocol decide the pairs: --config.protocol.noise_sigma=0.0
-scores without noise, --config.protocol.disjoint=True without common points. The table is also
-written to RUN_DIR/evaluation_SET.csv and .json.
+scores without noise, --config.protocol.disjoint=True without common points. Scans, of which
+--benchmark=3DLoMatch takes those of little overlap, have a table of registration recall too. All is
+also written to RUN_DIR/evaluation_SET.csv and .json.
 """
 
 import shlex
@@ -19,6 +20,7 @@ from ml_collections import config_flags
 from dbdnet_jax.checkpoint import load_best
 from dbdnet_jax.evaluation import evaluate
 from dbdnet_jax.model.params import Params
+from dbdnet_jax.programs import keep_compiled_programs
 from dbdnet_jax.report import render, save
 from dbdnet_jax.settings import parse_flags, read_settings
 from dbdnet_jax.weights import load_params, load_pretrained
@@ -42,6 +44,7 @@ def main(argv: list[str]) -> None:
     if argv[1:]:
         raise app.UsageError(f"arguments must be flags such as --params=cad; got {argv[1:]}.")
     logging.set_verbosity(logging.WARNING)
+    keep_compiled_programs()
     config_file = config_flags.get_config_filename(flags.FLAGS["config"])
     run_dir = Path(RUN_DIR.value or Path("runs") / Path(config_file).stem)
     try:

@@ -18,6 +18,7 @@ from ml_collections import config_flags
 
 from dbdnet_jax.checkpoint import STAGES, load_best
 from dbdnet_jax.evaluation import evaluate
+from dbdnet_jax.programs import keep_compiled_programs
 from dbdnet_jax.report import render, save
 from dbdnet_jax.settings import parse_flags, read_settings
 from dbdnet_jax.sources import load_source
@@ -45,6 +46,7 @@ def main(argv: list[str]) -> None:
         pairs = max(settings.overlap.batch_size, settings.registration.batch_size)
         devices = settings.train.devices or min(os.cpu_count() or 1, pairs)
         jax.config.update("jax_num_cpu_devices", devices)
+        keep_compiled_programs()
         for stage in stages:
             source = load_source(settings, getattr(settings, stage).batch_size)
             fit(settings, stage, run_dir, source)

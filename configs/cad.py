@@ -16,7 +16,11 @@ def get_config() -> ConfigDict:
     config = modelnet.get_config()
     config.model.overlap_channels = 16
     config.model.overlap_blocks = 2
+    config.model.overlap_matching = True
+    config.model.overlap_passes = 3
+    config.model.overlap_points = 256
     config.model.registration_channels = 16
+    config.model.registration_points = 256
     config.model.shared_blocks = 1
     config.model.rotation_blocks = 1
     config.model.translation_blocks = 1
@@ -26,15 +30,21 @@ def get_config() -> ConfigDict:
     config.model.neighbours = 16
     config.model.neighbour_space = "coordinates"  # one search per level instead of ten
     config.model.dropout = 0.0  # too small to overfit pairs that never repeat
+    config.model.min_points = 64
+    config.model.iterations = 2
 
     config.data.name = "cad"
+    config.train.batch_size = 2  # learns more from as many pairs than 8
     config.train.learning_rate = 1e-3
     config.train.clip_norm = 1.0
-    config.train.ema_decay = 0.999
-    config.train.warmup_epochs = 2.0
-    config.train.validate_every = 400
-    config.train.checkpoint_every = 200
-    config.train.validation_pairs = 96
-    config.overlap.epochs = 100.0
-    config.registration.epochs = 100.0
+    config.train.ema_decay = 0.998
+    config.train.warmup_epochs = 1.0
+    config.train.log_every = 100
+    config.train.validate_every = 1000
+    config.train.checkpoint_every = 1000
+    config.train.validation_pairs = 97
+    config.overlap.epochs = 50.0
+    config.overlap.gamma = 0.0
+    config.registration.epochs = 50.0
+    config.registration.masks = "imperfect"
     return config

@@ -14,10 +14,11 @@ from configs import cad
 def get_config() -> ConfigDict:
     """The differences from the full CAD training."""
     config = cad.get_config()
-    config.train.ema_decay = 0.99  # a memory of a hundred steps, of the few hundred there are
+    config.train.ema_decay = 0.99  # a memory of a hundred steps, of the few thousand there are
     config.train.warmup_epochs = 0.25
-    config.train.validate_every = 100
-    config.train.checkpoint_every = 100
-    config.overlap.epochs = 1.5
-    config.registration.epochs = 4.0
+    config.train.log_every = 50
+    config.train.validate_every = 500
+    config.train.checkpoint_every = 500
+    config.overlap.epochs = 3.0
+    config.registration.epochs = 5.0
     return config

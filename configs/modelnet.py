@@ -17,7 +17,9 @@ def get_config() -> ConfigDict:
     """Everything a run needs; the other configurations state their differences from this one."""
     config = ConfigDict()
     config.model = _model()
-    config.data = ConfigDict({"name": "modelnet40", "folder": "", "categories": "all"})
+    config.data = ConfigDict(
+        {"name": "modelnet40", "folder": "", "categories": "all", "procedural": 0}
+    )
     config.protocol = ConfigDict(
         {
             "points": 1024,
@@ -44,7 +46,7 @@ def get_config() -> ConfigDict:
             "epochs": 300.0,
             "batch_size": train.get_oneway_ref("batch_size"),
             "learning_rate": train.get_oneway_ref("learning_rate"),
-            "true_masks": False,
+            "masks": "predicted",
             "weights": {
                 "correspondence": 5.0,
                 "rotation": 1.0,
@@ -62,6 +64,7 @@ def _model() -> ConfigDict:
         {
             "overlap_channels": 64,
             "overlap_blocks": 4,
+            "overlap_matching": False,
             "registration_channels": 32,
             "shared_blocks": 3,
             "rotation_blocks": 3,
@@ -72,6 +75,9 @@ def _model() -> ConfigDict:
             "parameter_width": 1024,
             "neighbours": 20,
             "neighbour_space": "feature",
+            "overlap_passes": 1,
+            "overlap_points": 0,  # 0: all
+            "registration_points": 0,
             "overlap_threshold": 0.5,
             "min_points": 160,
             "iterations": 1,
@@ -86,6 +92,7 @@ def _train() -> ConfigDict:
     return ConfigDict(
         {
             "seed": 0,
+            "start": "",  # a file of weights to go on from
             "batch_size": 8,
             "learning_rate": 1e-4,
             "weight_decay": 1e-4,

@@ -33,6 +33,8 @@ from dbdnet_jax.model.dbdnet import register, register_given_overlap
 from dbdnet_jax.model.params import Params, init_params
 from dbdnet_jax.ops.sampling import prefix_mask
 from dbdnet_jax.pair_sets import load_test_pairs
+from dbdnet_jax.polish import polish
+from dbdnet_jax.recall import ScanRecall, Scans, correspondence_rmse_m, scan_recall
 from dbdnet_jax.settings import Settings
 from dbdnet_jax.types import Pair, Registration, Rigid
 
@@ -40,12 +42,16 @@ Method = Callable[[Pair], Rigid | Registration]
 
 
 class Row(NamedTuple):
-    """One method's line of a table; without a summary, the note says why it could not run."""
+    """One method's line of a table; without a summary, the note says why it could not run.
+
+    ``recall`` is there for pairs of scans only.
+    """
 
     method: str
     summary: Summary | None
     seconds_per_pair: float | None
     note: str = ""
+    recall: ScanRecall | None = None
 
 
 class Evaluation(NamedTuple):
@@ -83,15 +89,19 @@ def evaluate(
             "an evaluation needs a registration network; these params hold only the overlap "
             "network. Train it too: python train.py --stage=registration"
         )
-    name, pairs, digest = load_test_pairs(settings, run_dir, benchmark)
+    name, pairs, digest, scans = load_test_pairs(settings, run_dir, benchmark)
     if count is not None and count < len(pairs.source.count):
         name = f"{name}_first_{count}"
         pairs = jax.tree.map(lambda leaf: leaf[:count], pairs)
+        scans = scans and scans.first(count)
     methods = make_methods(params, settings.train.seed)
     if not pairs.source_normals.any():  # scans come without
         del methods["FGR, true normals"]
+    # The lengths of `polish` are those of a shape in the unit sphere.
+    if scans is None and params.overlap is not None:
+        methods["DBDNet, polished"] = from_polished_network(params)
     return Evaluation(
-        rows=evaluate_methods(methods, pairs),
+        rows=evaluate_methods(methods, pairs, scans),
         constant_overlap=constant_overlap(pairs),
         pair_set=name,
         pairs=len(pairs.source.count),
@@ -154,6 +164,12 @@ def from_network(params: Params) -> Method:
     return lambda pair: compiled(params, pair)
 
 
+def from_polished_network(params: Params) -> Method:
+    """The network's motion, refined on the clouds themselves: no ground truth, no normals given."""
+    compiled = jax.jit(_register_and_polish)
+    return lambda pair: compiled(params, pair)
+
+
 def from_true_overlap(params: Params) -> Method:
     """The registration network behind the true overlap labels: a bound, since it is told them.
 
@@ -163,8 +179,10 @@ def from_true_overlap(params: Params) -> Method:
     return lambda pair: compiled(params, pair)
 
 
-def evaluate_method(name: str, method: Method, pairs: Pair) -> Row:
+def evaluate_method(name: str, method: Method, pairs: Pair, scans: Scans | None = None) -> Row:
     """One method over stacked NumPy pairs (leading axis on every field).
+
+    With ``scans``, those of the same pairs, the row has their registration recall too.
 
     The time is the median over the pairs of the wall seconds until the answer is there. The
     method is called once on the first pair beforehand, so that no compilation is in it. A method
@@ -173,6 +191,7 @@ def evaluate_method(name: str, method: Method, pairs: Pair) -> Row:
     score = jax.jit(_score)
     errors: list[PairErrors] = []
     seconds: list[float] = []
+    rmse_m: list[float] = []
     try:
         jax.block_until_ready(method(_pair(pairs, 0)))
         for i in range(len(pairs.source.count)):
@@ -181,16 +200,23 @@ def evaluate_method(name: str, method: Method, pairs: Pair) -> Row:
             answer = jax.block_until_ready(method(pair))
             seconds.append(time.perf_counter() - start)
             errors.append(jax.device_get(score(answer, pair)))
+            if scans is not None:
+                rmse_m.append(correspondence_rmse_m(answer, *scans.correspondences[i]))
     except MissingBaselineError as error:
         return Row(name, None, None, str(error))
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *errors)
-    return Row(name, summarise(stacked), float(np.median(seconds)))
+    recall = None
+    if scans is not None:
+        recall = scan_recall(stacked.rotation_deg, stacked.translation, np.array(rmse_m), scans)
+    return Row(name, summarise(stacked), float(np.median(seconds)), recall=recall)
 
 
-def evaluate_methods(methods: Mapping[str, Method], pairs: Pair) -> list[Row]:
+def evaluate_methods(
+    methods: Mapping[str, Method], pairs: Pair, scans: Scans | None = None
+) -> list[Row]:
     """One row per method, in the given order, all on the same pairs; shows its progress."""
     bar = tqdm(methods.items(), desc="evaluating", unit="method", leave=False, disable=None)
-    return [evaluate_method(name, method, pairs) for name, method in bar]
+    return [evaluate_method(name, method, pairs, scans) for name, method in bar]
 
 
 def constant_overlap(pairs: Pair) -> OverlapSummary:
@@ -209,6 +235,12 @@ def _register(params: Params, pair: Pair) -> Registration:
     source, target = pair.source, pair.target
     masks = (prefix_mask(len(cloud.points), cloud.count) for cloud in (source, target))
     return register(params, source.points, target.points, *masks)
+
+
+def _register_and_polish(params: Params, pair: Pair) -> Rigid:
+    answer = _register(params, pair)
+    motion = Rigid(answer.rotation, answer.translation)
+    return polish(pair.source, pair.target, motion).target_from_source
 
 
 def _register_given_labels(params: Params, pair: Pair) -> Rigid:

@@ -10,11 +10,15 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from dbdnet_jax.model.matching import Matched
+from dbdnet_jax.ops.grouping import squared_distances
 from dbdnet_jax.ops.rigid import HIGHEST, apply
 from dbdnet_jax.ops.sampling import prefix_mask
 from dbdnet_jax.types import Branch, Cloud, Pair, Registration, Rigid
 
 SMALLEST_PROBABILITY = 1e-12  # keeps log finite once a float32 sigmoid has saturated
+SMALLEST_SLACK = 1e-3  # the same for the mass that a row without a match keeps back
+MATCH_WIDTH = 0.06  # of the labels of soft matches: half the spacing of 256 points of a shape
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +40,7 @@ class OverlapTerms(NamedTuple):
 
     source_focal: Float[Array, ""]
     target_focal: Float[Array, ""]
+    matching: Float[Array, ""]
 
 
 class RegistrationTerms(NamedTuple):
@@ -107,18 +112,53 @@ def distance_loss(
     return mean_l1(registered, true_targets, valid)
 
 
+def matching_loss(
+    log_matrix: Float[Array, "n m"], source: Cloud, target: Cloud, truth: Rigid
+) -> Float[Array, ""]:
+    """Mean cross-entropy of soft matches, over the points of both clouds.
+
+    A point's label is a bell of `MATCH_WIDTH` around its true place in the other cloud; without a
+    point there, the label is to keep its mass back.
+    """
+    valid = _valid_rows(source), _valid_rows(target)
+    both = valid[0][:, None] & valid[1][None, :]
+    distance = squared_distances(apply(truth, source.points), target.points)
+    near = both & (distance < (2.5 * MATCH_WIDTH) ** 2)
+    label = jnp.where(near, jnp.exp(-distance / (2 * MATCH_WIDTH**2)), 0.0)
+    log_matrix = jnp.where(both, log_matrix, 0.0)
+    mass = jnp.where(both, jnp.exp(log_matrix), 0.0)
+    means = []
+    for axis, rows in ((1, valid[0]), (0, valid[1])):
+        total = jnp.sum(label, axis=axis)
+        matched = -jnp.sum(label * log_matrix, axis=axis) / jnp.where(total > 0, total, 1.0)
+        slack = jnp.maximum(1 - jnp.sum(mass, axis=axis), SMALLEST_SLACK)
+        loss = jnp.where(rows, jnp.where(total > 0, matched, -jnp.log(slack)), 0.0)
+        means.append(jnp.sum(loss) / jnp.maximum(jnp.sum(rows), 1))
+    return (means[0] + means[1]) / 2
+
+
 def overlap_loss(
     source_probability: Float[Array, " n"],
     target_probability: Float[Array, " m"],
     pair: Pair,
     gamma: float = 4.0,
+    matched: Matched | None = None,
 ) -> tuple[Float[Array, ""], OverlapTerms]:
-    """Focal loss of both clouds' overlap probabilities, each cloud counting half."""
+    """Focal loss of both clouds' overlap probabilities, each cloud counting half.
+
+    A network that also matches is judged by its matches and by the rotation they ask for.
+    """
     source_valid, target_valid = _valid_rows(pair.source), _valid_rows(pair.target)
     source = focal_loss(source_probability, pair.source_overlap, source_valid, gamma)
     target = focal_loss(target_probability, pair.target_overlap, target_valid, gamma)
-    terms = OverlapTerms(source / 2, target / 2)
-    return terms.source_focal + terms.target_focal, terms
+    matching = jnp.zeros_like(source)
+    if matched is not None:
+        own, other = (Cloud(*cloud) for cloud in zip(*matched.clouds, strict=True))
+        truth = pair.target_from_source
+        matching = matching_loss(matched.log_matrix, own, other, truth)
+        matching += rotation_loss(matched.motion.rotation, truth.rotation)
+    terms = OverlapTerms(source / 2, target / 2, matching)
+    return jnp.stack(terms).sum(), terms
 
 
 def registration_loss(

@@ -10,7 +10,8 @@ import numpy as np
 from dbdnet_jax.data.cad import HALVES, cad_split
 from dbdnet_jax.data.frozen import CAD_VARIANTS, cad_test_pairs, freeze, thaw
 from dbdnet_jax.data.modelnet40 import load_modelnet40
-from dbdnet_jax.data.threedmatch import load_info, load_pair
+from dbdnet_jax.data.threedmatch import load_correspondences, load_info, load_pair
+from dbdnet_jax.recall import Scans
 from dbdnet_jax.settings import Settings
 from dbdnet_jax.types import Pair
 
@@ -19,11 +20,15 @@ CAD_PAIRS = 200
 
 
 class PairSet(NamedTuple):
-    """Stacked NumPy pairs (leading axis on every field), what they are, and their sha256."""
+    """Stacked NumPy pairs (leading axis on every field), what they are, and their sha256.
+
+    ``scans`` is there for pairs of scans only.
+    """
 
     name: str
     pairs: Pair
     digest: str
+    scans: Scans | None = None
 
 
 def load_test_pairs(settings: Settings, run_dir: str | Path, benchmark: str = "3DMatch") -> PairSet:
@@ -60,6 +65,7 @@ def _scans(settings: Settings, benchmark: str, cache: Path) -> PairSet:
     """All pairs of 3DMatch or 3DLoMatch; their fragments are read one after the other."""
     folder, protocol = settings.data.folder, settings.protocol
     info = load_info(folder, benchmark)
+    rows = range(len(info))
     pairs = [
         load_pair(
             folder,
@@ -70,10 +76,15 @@ def _scans(settings: Settings, benchmark: str, cache: Path) -> PairSet:
             radius_m=protocol.overlap_radius,
             cache=cache,
         )
-        for i in range(len(info))
+        for i in rows
     ]
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *pairs)
     digest = hashlib.sha256()
     for leaf in jax.tree.leaves(stacked):
         digest.update(np.ascontiguousarray(leaf).tobytes())
-    return PairSet(benchmark, stacked, digest.hexdigest())
+    correspondences = []  # of all pairs at once: some hundred MB in float32
+    for i in rows:
+        points = load_correspondences(folder, info, i, protocol.overlap_radius)
+        correspondences.append((points[0].astype(np.float32), points[1].astype(np.float32)))
+    scans = Scans(info.scenes, info.consecutive, correspondences)
+    return PairSet(benchmark, stacked, digest.hexdigest(), scans)

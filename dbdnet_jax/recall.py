@@ -14,21 +14,40 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 
-from dbdnet_jax.types import Rigid
+from dbdnet_jax.types import Registration, Rigid
 
 
-class Recall(NamedTuple):
-    """The share of pairs that are registered, 0..1.
+class Scans(NamedTuple):
+    """What recall needs of ``p`` pairs of scans beside the motions; one entry for each pair.
 
-    ``pair_mean`` weighs every pair alike, ``scene_mean`` every scene; ``by_scene`` holds the
-    scenes' own recalls.
+    ``scenes`` are names, ``consecutive`` marks neighbours in the scanner's path, and
+    ``correspondences`` are source and target points (k, 3) that meet under the true pose, metres.
     """
 
-    pair_mean: float
-    scene_mean: float
-    by_scene: dict[str, float]
+    scenes: Sequence[str]
+    consecutive: Bool[np.ndarray, " p"]
+    correspondences: Sequence[tuple[Float[np.ndarray, "k 3"], Float[np.ndarray, "k 3"]]]
+
+    def first(self, count: int) -> Scans:
+        """Those of the first pairs."""
+        return Scans(self.scenes[:count], self.consecutive[:count], self.correspondences[:count])
+
+
+class ScanRecall(NamedTuple):
+    """The share of pairs that are registered, 0..1, under either definition.
+
+    A pair mean weighs every pair alike, a scene mean every scene. ``..._apart`` leaves out
+    consecutive fragments: the one to hold against 3DMatch's benchmark, None when there is no
+    other pair.
+    """
+
+    recall_15deg_30cm_pair_mean: float
+    recall_15deg_30cm_scene_mean: float
+    recall_rmse_20cm_pair_mean: float
+    recall_rmse_20cm_scene_mean: float
+    recall_rmse_20cm_scene_mean_apart: float | None
 
 
 def within_15deg_30cm(
@@ -39,7 +58,9 @@ def within_15deg_30cm(
 
 
 def correspondence_rmse_m(
-    predicted: Rigid, source: Float[np.ndarray, "k 3"], target: Float[np.ndarray, "k 3"]
+    predicted: Rigid | Registration,
+    source: Float[np.ndarray, "k 3"],
+    target: Float[np.ndarray, "k 3"],
 ) -> float:
     """Root of the mean over the true correspondences of ``|R source + t - target|^2``, metres.
 
@@ -57,47 +78,37 @@ def rmse_within_20cm(rmse_m: Float[np.ndarray, " p"]) -> Bool[np.ndarray, " p"]:
     return np.asarray(rmse_m) < 0.2
 
 
-def recall(registered: Bool[np.ndarray, " p"], scenes: Sequence[str]) -> Recall:
-    """Recall over pairs and over scenes; ``scenes[i]`` is the scene of pair ``i``.
+def scene_mean(registered: Bool[np.ndarray, " p"], scenes: Shaped[np.ndarray, " p"]) -> float:
+    """Mean over the scenes of each one's share; ``scenes[i]`` is the scene of pair ``i``."""
+    return float(np.mean([registered[scenes == scene].mean() for scene in np.unique(scenes)]))
+
+
+def scan_recall(
+    rotation_error_deg: Float[np.ndarray, " p"],
+    translation_error_m: Float[np.ndarray, " p"],
+    rmse_m: Float[np.ndarray, " p"],
+    scans: Scans,
+) -> ScanRecall:
+    """Every recall of one method.
 
     Raises:
         ValueError: no pair, or not one scene for each.
     """
-    registered = np.asarray(registered, dtype=bool)
-    if not len(registered) or len(scenes) != len(registered):
+    scenes, pairs = np.array(scans.scenes), len(rmse_m)
+    if not pairs or len(scenes) != pairs:
         raise ValueError(
-            f"recall needs at least one pair and a scene for each; got {len(registered)} pairs and "
-            f"{len(scenes)} scenes. Give Info.scenes of the same pairs."
+            f"recall needs at least one pair and a scene for each; got {pairs} pairs and "
+            f"{len(scenes)} scenes. Give the Scans of the same pairs."
         )
-    names = np.array(scenes)
-    by_scene = {str(name): float(registered[names == name].mean()) for name in np.unique(names)}
-    return Recall(float(registered.mean()), float(np.mean(list(by_scene.values()))), by_scene)
-
-
-def recall_table(
-    rotation_error_deg: Float[np.ndarray, " p"],
-    translation_error_m: Float[np.ndarray, " p"],
-    rmse_m: Float[np.ndarray, " p"],
-    scenes: Sequence[str],
-    consecutive: Bool[np.ndarray, " p"],
-) -> dict[str, float]:
-    """Every recall under a name that says its definition and its mean.
-
-    The last entry is the one to hold against 3DMatch's benchmark; it is left out when all
-    fragments are consecutive.
-    """
-    by_pose = recall(within_15deg_30cm(rotation_error_deg, translation_error_m), scenes)
+    posed = within_15deg_30cm(rotation_error_deg, translation_error_m)
     near = rmse_within_20cm(rmse_m)
-    by_rmse = recall(near, scenes)
-    table = {
-        "recall (R < 15 deg, t < 0.3 m), pair mean": by_pose.pair_mean,
-        "recall (R < 15 deg, t < 0.3 m), scene mean": by_pose.scene_mean,
-        "recall (RMSE < 0.2 m), pair mean": by_rmse.pair_mean,
-        "recall (RMSE < 0.2 m), scene mean": by_rmse.scene_mean,
-    }
-    apart = ~np.asarray(consecutive, dtype=bool)
-    if apart.any():
-        name = "recall (RMSE < 0.2 m, fragments not consecutive), scene mean"
-        kept = [scene for scene, far in zip(scenes, apart, strict=True) if far]
-        table[name] = recall(near[apart], kept).scene_mean
-    return table
+    apart = ~np.asarray(scans.consecutive, bool)
+    return ScanRecall(
+        recall_15deg_30cm_pair_mean=float(posed.mean()),
+        recall_15deg_30cm_scene_mean=scene_mean(posed, scenes),
+        recall_rmse_20cm_pair_mean=float(near.mean()),
+        recall_rmse_20cm_scene_mean=scene_mean(near, scenes),
+        recall_rmse_20cm_scene_mean_apart=(
+            scene_mean(near[apart], scenes[apart]) if apart.any() else None
+        ),
+    )

@@ -33,9 +33,18 @@ _FULL = (_OVERLAP, "feature_extractor.", "RegNet.")
 _UNUSED = ("self_attention.", "self_layer_norm.", "cross_attention.", "cross_layer_norm.")
 _FIXED = {
     name: getattr(ModelConfig(), name)
-    for name in ("neighbour_space", "heads", "head_width", "parameter_width")
+    for name in (
+        "neighbour_space",
+        "heads",
+        "head_width",
+        "parameter_width",
+        "overlap_matching",
+        "overlap_passes",
+        "overlap_points",
+        "registration_points",
+    )
 }
-_FIX = "Was it saved by the released code, and not altered since?"
+_FIX = "Give a checkpoint that the released code saved, unaltered."
 # Our names to theirs, in this order, before / becomes a dot.
 _RULES = (
     (r"^overlap/", "overlap_predictor/"),

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 from dbdnet_jax.evaluation import Evaluation, Row
 from dbdnet_jax.metrics import OverlapSummary, Summary
+from dbdnet_jax.recall import ScanRecall
 
 CONSTANT_NAME = "all points overlapping (constant)"
 
@@ -32,9 +33,11 @@ def _figure(field: str, digits: int) -> Callable[[Row], str]:
     return cell
 
 
-def _percent(field: str) -> Callable[[Row], str]:
+def _percent(part: str, field: str) -> Callable[[Row], str]:
     def cell(row: Row) -> str:
-        return "-" if row.summary is None else f"{100 * getattr(row.summary, field):.1f} %"
+        record = getattr(row, part)
+        share = None if record is None else getattr(record, field)
+        return "-" if share is None else f"{100 * share:.1f} %"
 
     return cell
 
@@ -52,9 +55,19 @@ MOTION_COLUMNS = (
     Column(("Error t", "mean", "unit"), _figure("error_translation", 4)),
     Column(("Error R", "median", "deg"), _figure("median_rotation_deg", 3)),
     Column(("Error t", "median", "unit"), _figure("median_translation", 4)),
-    Column(("Recall", "< 5 deg", "& < 0.1"), _percent("recall_5deg_0p1")),
-    Column(("Recall", "< 15 deg", "& < 0.3"), _percent("recall_15deg_30cm")),
+    Column(("Recall", "< 5 deg", "& < 0.1"), _percent("summary", "recall_5deg_0p1")),
+    Column(("Recall", "< 15 deg", "& < 0.3"), _percent("summary", "recall_15deg_30cm")),
     Column(("Time", "median", "s/pair"), _seconds),
+)
+RECALL_COLUMNS = tuple(
+    Column(head, _percent("recall", field))
+    for field, head in {
+        "recall_15deg_30cm_pair_mean": ("R < 15 deg", "t < 0.3 m", "pair mean"),
+        "recall_15deg_30cm_scene_mean": ("R < 15 deg", "t < 0.3 m", "scene mean"),
+        "recall_rmse_20cm_pair_mean": ("RMSE", "< 0.2 m", "pair mean"),
+        "recall_rmse_20cm_scene_mean": ("RMSE", "< 0.2 m", "scene mean"),
+        "recall_rmse_20cm_scene_mean_apart": ("RMSE, apart", "< 0.2 m", "scene mean"),
+    }.items()
 )
 OVERLAP_HEADS = (
     ("Accuracy", "right /", "all points"),
@@ -68,21 +81,26 @@ RMSE, MAE: over all pairs and the three components of the predicted minus the tr
 norm of the translation of T_true^-1 T. Recall: share of pairs with both errors below. Unit: that of
 the clouds. An answer that is not finite counts as 180 deg and 2 |t_true|. Time: wall clock, one
 pair at a time, compilation excluded."""
+RECALL_DEFINITIONS = """\
+Share of pairs with a rotation error < 15 deg and a translation error < 0.3 m, or with an RMSE
+< 0.2 m: that of all true correspondences, the points of the whole source fragment whose nearest
+target point under the true pose is closer than config.protocol.overlap_radius. Pair mean: every
+pair counts alike; scene mean: every scene does. Apart: without pairs of consecutive fragments, as
+3DMatch's benchmark counts."""
 OVERLAP_DEFINITIONS = """\
 Probability > 0.5 counts as overlapping; TP, FP, FN pooled over the points of both clouds of all
 pairs."""
 
 
 def render(evaluation: Evaluation) -> str:
-    """Both tables as fixed-width text, with the definitions and where the figures come from."""
-    heads = [("method", "", ""), *(column.head for column in MOTION_COLUMNS)]
-    body = [
-        [row.method, *(column.cell(row) for column in MOTION_COLUMNS)] for row in evaluation.rows
-    ]
-    parts = [_table(heads, body), DEFINITIONS, *_remarks(evaluation.rows)]
+    """The tables as fixed-width text, with the definitions and where the figures come from."""
+    rows = evaluation.rows
+    parts = [_of_columns("method", MOTION_COLUMNS, rows), DEFINITIONS, *_remarks(rows)]
+    if any(row.recall for row in rows):
+        parts += ["", _of_columns("registration recall", RECALL_COLUMNS, rows), RECALL_DEFINITIONS]
     predicted = [
         (row.method, row.summary.overlap)
-        for row in evaluation.rows
+        for row in rows
         if row.summary is not None and row.summary.overlap is not None
     ]
     if predicted:
@@ -130,6 +148,12 @@ def write_json(path: str | Path, evaluation: Evaluation) -> None:
     _write_atomically(Path(path), json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
+def _of_columns(name: str, columns: Sequence[Column], rows: Sequence[Row]) -> str:
+    """A table of one line for each method."""
+    heads = [(name, "", ""), *(column.head for column in columns)]
+    return _table(heads, [[row.method, *(column.cell(row) for column in columns)] for row in rows])
+
+
 def _table(heads: Sequence[tuple[str, str, str]], body: Sequence[Sequence[str]]) -> str:
     """Fixed-width columns two spaces apart, the first to the left, the others to the right."""
     lines = [list(line) for line in zip(*heads, strict=True)]
@@ -170,11 +194,13 @@ def _provenance_fields(evaluation: Evaluation) -> dict[str, Any]:
 def _flat(row: Row) -> dict[str, Any]:
     summary = dict.fromkeys(Summary._fields) if row.summary is None else row.summary._asdict()
     overlap = summary.pop("overlap")
+    recall = dict.fromkeys(ScanRecall._fields) if row.recall is None else row.recall._asdict()
     del summary["pairs"]  # the report's own figure
     return (
         {"method": row.method}
         | summary
         | _flat_overlap(overlap)
+        | recall
         | {"seconds_per_pair": row.seconds_per_pair, "note": row.note}
     )
 

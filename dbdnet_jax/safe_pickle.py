@@ -161,12 +161,17 @@ class _Reader(pickle.Unpickler):
             )
         storage = Storage(str(key), code, *_counts((length,), "The size of a storage"))
         if self.storages.setdefault(storage.key, storage) != storage:
-            raise CheckpointError(f"Storage {storage.key!r} is declared twice, differently.")
+            raise CheckpointError(
+                f"A storage has one type and size; {storage.key!r} is declared twice, differently. "
+                "Fetch the file or save it again."
+            )
         return storage
 
     def _encode(self, text: str, encoding: str) -> bytes:
         if encoding != "latin1":
-            raise CheckpointError(f"Bytes are written as latin1; got {str(encoding)[:40]!r}.")
+            raise CheckpointError(
+                f"Bytes are written as latin1; got {str(encoding)[:40]!r}. Do not trust the file."
+            )
         return self._charged(text).encode("latin1")
 
     def _charged(self, items: Any) -> Any:
@@ -245,7 +250,8 @@ def _array(raw: Any, dtype: Any, shape: Any, order: str) -> np.ndarray:
     shape = _counts(shape, "The shape of an array")
     if len(raw) != math.prod(shape) * dtype.value.itemsize:
         raise CheckpointError(
-            f"An array of shape {shape} and type {dtype.value} does not fill {len(raw)} bytes."
+            f"An array of shape {shape} and type {dtype.value} does not fill {len(raw)} bytes. "
+            "Fetch the file or save it again."
         )
     array = np.ndarray(shape, dtype.value, raw, order="F" if order == "F" else "C")
     array.flags.writeable = False
@@ -261,7 +267,7 @@ def _tensor(storage: Any, offset: Any, shape: Any, strides: Any, *_: Any) -> _Te
     if math.prod(shape) and last >= storage.length:
         raise CheckpointError(
             f"A tensor must lie inside its storage of {storage.length} numbers; shape {shape}, "
-            f"strides {strides} and offset {offset} reach number {last + 1}."
+            f"strides {strides} and offset {offset} reach number {last + 1}. Do not trust the file."
         )
     return _Tensor(storage, offset, shape, strides)
 

@@ -16,6 +16,7 @@ from dbdnet_jax.losses import LossWeights
 from dbdnet_jax.model.config import ModelConfig
 
 DATA_SETS = ("cad", "modelnet40", "threedmatch")
+MASKS = ("predicted", "truth", "imperfect")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,6 +26,9 @@ class DataSettings:
     name: str
     folder: str
     categories: str  # "all", or one half of the shape classes: "seen" or "unseen"
+    procedural: int = (
+        0  # generated shapes to train on beside those of "cad": 15 ms each, every start
+    )
 
     def __post_init__(self):
         """Refuse an unknown data set."""
@@ -32,16 +36,23 @@ class DataSettings:
             raise ValueError(
                 f"config.data.name must be one of {DATA_SETS}; got {self.name!r}. Choose one."
             )
+        if self.procedural < 0 or (self.procedural and self.name != "cad"):
+            raise ValueError(
+                "config.data.procedural must not be negative, and 0 for other data than 'cad'; got "
+                f"{self.procedural} for {self.name!r}. Use 0."
+            )
 
 
 @dataclasses.dataclass(frozen=True)
 class TrainSettings:
     """What both stages share; cadences are in steps, 0 switches clipping and the average off.
 
+    ``start`` is a file of weights that the networks in it start from ("": fresh ones).
     ``batch_size`` and ``learning_rate`` are what the stages' own fields follow until set.
     """
 
     seed: int
+    start: str
     batch_size: int
     learning_rate: float
     weight_decay: float
@@ -85,18 +96,24 @@ class OverlapSettings:
 class RegistrationSettings:
     """Stage 2: the registration network behind the frozen overlap network.
 
-    With ``true_masks`` it trains and validates on the true overlap instead, and needs no stage 1.
+    ``masks`` says which points it is given: those that the overlap network "predicted"; those
+    that overlap in "truth"; or "imperfect" ones (`pairs.imperfect_overlap`), with the true ones
+    for validation. The last two need no stage 1.
     """
 
     epochs: float
     batch_size: int
     learning_rate: float
-    true_masks: bool
+    masks: str
     weights: LossWeights
 
     def __post_init__(self):
-        """Refuse a stage of nothing."""
+        """Refuse a stage of nothing, and masks that there are not."""
         _check_stage("registration", self)
+        if self.masks not in MASKS:
+            raise ValueError(
+                f"config.registration.masks must be one of {MASKS}; got {self.masks!r}. Choose one."
+            )
 
 
 @dataclasses.dataclass(frozen=True)

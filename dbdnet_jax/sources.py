@@ -7,9 +7,7 @@ one would have seen.
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -20,7 +18,9 @@ from jaxtyping import Array, Int, PRNGKeyArray
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.modelnet40 import load_modelnet40
 from dbdnet_jax.data.pairs import Protocol, make_pair
-from dbdnet_jax.data.shapes import Shapes, select
+from dbdnet_jax.data.procedural import procedural_shapes
+from dbdnet_jax.data.shapes import Shapes, joined, select
+from dbdnet_jax.files import cache_folder
 from dbdnet_jax.settings import DataSettings, Settings
 from dbdnet_jax.types import Pair
 
@@ -72,7 +72,10 @@ def load_training_shapes(data: DataSettings) -> tuple[Shapes, Shapes]:
     """
     if data.name == "cad":
         half = None if data.categories == "all" else data.categories
-        return cad_split("train", half), cad_split("val", half)
+        train = cad_split("train", half)
+        if data.procedural:
+            train = joined(train, procedural_shapes(data.procedural, seed=0))
+        return train, cad_split("val", half)
     shapes = load_modelnet40(data.folder, "train", data.categories)
     held_out = np.arange(len(shapes)) % HELD_OUT == HELD_OUT - 1
     return select(shapes, ~held_out), select(shapes, held_out)
@@ -128,11 +131,10 @@ def _scans(settings: Settings, batch_size: int) -> Source:
 
     folder, protocol = settings.data.folder, settings.protocol
     train, validation = load_info(folder, "train"), load_info(folder, "valid")
-    home = os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")
     options: dict[str, Any] = {
         "points": protocol.points,
         "radius_m": protocol.overlap_radius,
-        "cache": Path(home) / "dbdnet_jax" / "threedmatch",
+        "cache": cache_folder() / "threedmatch",
     }
     count = min(settings.train.validation_pairs, len(validation))
     rows = [i * len(validation) // count for i in range(count)]

@@ -6,6 +6,7 @@ frozen and deterministic (the released code leaves the frozen network's dropout 
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,14 +16,26 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dbdnet_jax.checkpoint import load_best
+from dbdnet_jax.data.pairs import imperfect_overlap, moved_pair, starting_motion
 from dbdnet_jax.losses import overlap_loss, registration_loss
 from dbdnet_jax.metrics import pair_confusion, registration_errors
 from dbdnet_jax.model.config import ModelConfig
-from dbdnet_jax.model.dbdnet import predict_overlap, register_given_overlap
-from dbdnet_jax.model.params import Params, init_params
+from dbdnet_jax.model.dbdnet import (
+    predict_overlap,
+    predict_overlap_and_matches,
+    register_given_overlap,
+)
+from dbdnet_jax.model.params import (
+    Params,
+    flatten,
+    init_params,
+    parameter_shapes,
+    require_shapes,
+)
 from dbdnet_jax.safe_pickle import CheckpointError
 from dbdnet_jax.settings import Settings
 from dbdnet_jax.types import Pair
+from dbdnet_jax.weights import load_params
 
 # (trainable, frozen, pair, key) -> (loss, NamedTuple of its terms)
 LossFunction = Callable[[Any, Any, Pair, PRNGKeyArray], tuple[Float[Array, ""], Any]]
@@ -46,13 +59,32 @@ def make_task(settings: Settings, stage: str, run_dir: str | Path) -> Task:
         CheckpointError: "registration" without a trained overlap network in ``run_dir``.
     """
     model = settings.model
-    fresh = init_params(jax.random.key(settings.train.seed), model)
+    fresh = _first_params(settings)
     if stage == "overlap":
         loss, validate = _overlap_functions(settings)
         return Task(fresh.overlap, None, loss, validate)
     loss, validate = _registration_functions(settings)
-    frozen = None if settings.registration.true_masks else _trained_overlap(model, run_dir)
+    predicted = settings.registration.masks == "predicted"
+    frozen = _trained_overlap(model, run_dir) if predicted else None
     return Task(fresh.registration, frozen, loss, validate)
+
+
+def _first_params(settings: Settings) -> Params:
+    """Fresh parameters, or those of ``config.train.start`` where it holds the network."""
+    fresh = init_params(jax.random.key(settings.train.seed), settings.model)
+    if not settings.train.start:
+        return fresh
+    start = load_params(settings.train.start)
+    merged = Params(
+        start.overlap or fresh.overlap, start.registration or fresh.registration, settings.model
+    )
+    require_shapes(
+        {name: array.shape for name, array in flatten(merged).items()},
+        parameter_shapes(settings.model),
+        f"config.train.start={settings.train.start}",
+        "Give weights of the same widths as config.model, or set config.train.start=''.",
+    )
+    return merged
 
 
 def _trained_overlap(model: ModelConfig, run_dir: str | Path) -> Any:
@@ -60,7 +92,7 @@ def _trained_overlap(model: ModelConfig, run_dir: str | Path) -> Any:
     if params is None or params.overlap is None:
         raise CheckpointError(
             f"the registration stage needs a trained overlap network; {run_dir} has none. Train "
-            "it first (--stage=overlap or both), or set config.registration.true_masks=True."
+            "it first (--stage=overlap or both), or set config.registration.masks='truth'."
         )
     if params.config != model:
         raise CheckpointError(
@@ -75,16 +107,23 @@ def _overlap_functions(settings: Settings) -> tuple[LossFunction, Validation]:
 
     def loss(trainable, frozen, pair, key):
         params = Params(trainable, None, model)
-        key = key if model.dropout else None
-        return overlap_loss(*predict_overlap(params, pair.source, pair.target, key), pair, gamma)
+        start_key, dropout_key = jax.random.split(key)
+        dropout_key = dropout_key if model.dropout else None
+        # Each pass is trained for itself, from starts such as the passes before it may leave.
+        start = starting_motion(start_key, pair) if model.overlap_passes > 1 else None
+        *predicted, matched = predict_overlap_and_matches(
+            params, pair.source, pair.target, dropout_key, start
+        )
+        return overlap_loss(*predicted, pair, gamma, matched)
 
     def validate(trainable, frozen, pair):
-        predicted = predict_overlap(Params(trainable, None, model), pair.source, pair.target)
+        params = Params(trainable, None, model)
+        *predicted, matched = predict_overlap_and_matches(params, pair.source, pair.target)
         counts = pair_confusion(*predicted, pair)
         wrong = counts.false_positive + counts.false_negative
         return {
             "error": wrong / (wrong + counts.true_positive + counts.true_negative),
-            "loss": overlap_loss(*predicted, pair, gamma)[0],
+            "loss": overlap_loss(*predicted, pair, gamma, matched)[0],
             "f1": 2 * counts.true_positive / jnp.maximum(2 * counts.true_positive + wrong, 1),
         }
 
@@ -94,20 +133,32 @@ def _overlap_functions(settings: Settings) -> tuple[LossFunction, Validation]:
 def _registration_functions(settings: Settings) -> tuple[LossFunction, Validation]:
     model, stage = settings.model, settings.registration
 
-    def answer(trainable, frozen, pair, key=None):
-        if stage.true_masks:
-            masks = [pair.source_overlap * 1.0, pair.target_overlap * 1.0]
-        else:
-            masks = predict_overlap(Params(frozen, None, model), pair.source, pair.target)
+    def answer(trainable, pair, masks, model=model, key=None):
         params = Params(None, trainable, model)
-        key = key if model.dropout else None
+        masks = [mask * 1.0 for mask in masks]
         return register_given_overlap(params, pair.source, pair.target, *masks, key)
 
+    def given(frozen, pair):
+        if stage.masks == "predicted":
+            return predict_overlap(Params(frozen, None, model), pair.source, pair.target)
+        return pair.source_overlap, pair.target_overlap
+
     def loss(trainable, frozen, pair, key):
-        return registration_loss(answer(trainable, frozen, pair, key), pair, stage.weights)
+        mask_key, start_key, dropout_key = jax.random.split(key, 3)
+        masks = given(frozen, pair)
+        if stage.masks == "imperfect":
+            masks = imperfect_overlap(mask_key, pair, settings.protocol.overlap_radius)
+        one = model
+        if model.iterations > 1 and not model.released:
+            # Each iteration is trained for itself, from starts as those before it may leave.
+            pair = moved_pair(pair, starting_motion(start_key, pair))
+            one = dataclasses.replace(model, iterations=1)
+        dropout_key = dropout_key if model.dropout else None
+        found = answer(trainable, pair, masks, one, dropout_key)
+        return registration_loss(found, pair, stage.weights)
 
     def validate(trainable, frozen, pair):
-        found = answer(trainable, frozen, pair)
+        found = answer(trainable, pair, given(frozen, pair))
         errors = registration_errors(found, pair)
         return {
             "error": errors.rotation_deg,

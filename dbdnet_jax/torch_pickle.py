@@ -55,7 +55,9 @@ def load_pickle(path: str | Path) -> Any:
 def _map(path: str | Path) -> mmap.mmap:
     with open(path, "rb") as file:
         if not file.seek(0, io.SEEK_END):
-            raise CheckpointError(f"{path}: a checkpoint holds an object; the file is empty.")
+            raise CheckpointError(
+                f"{path}: a checkpoint holds an object; the file is empty. Fetch it again."
+            )
         return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
 
 
@@ -79,7 +81,7 @@ def _read_zip(path: str | Path, data: mmap.mmap) -> Any:
     if len(roots) != 1:
         raise CheckpointError(
             f"A torch archive holds one data.pkl; this one holds {len(roots)}. "
-            "Is it another kind of zip file?"
+            "Give a file that torch.save wrote."
         )
 
     def region(name: str) -> memoryview:
@@ -112,7 +114,7 @@ def _read_stream(data: mmap.mmap) -> Any:
     if magic != _STREAM_MAGIC:
         raise CheckpointError(
             "A torch file starts with a zip header or with torch's magic number; this is another "
-            "pickle. Was it written by torch.save?"
+            "pickle. Give a file that torch.save wrote."
         )
     version, at, _ = unpickle(data, at)
     if version != _STREAM_VERSION:

@@ -22,6 +22,7 @@ from dbdnet_jax.training import run_task
 PROTOCOL = Protocol(points=24, keep=0.5)
 EPOCHS, BATCH, RATE = 6.0, 4, 0.1  # 12 steps
 TRAIN = TrainSettings(
+    start="",
     seed=5,
     batch_size=BATCH,
     learning_rate=RATE,

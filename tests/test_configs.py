@@ -77,7 +77,7 @@ def test_modelnet_is_the_papers():
     assert settings.registration.weights == LossWeights(
         correspondence=5.0, rotation=1.0, translation=1.0, distance=1.0
     )
-    assert not settings.registration.true_masks
+    assert settings.registration.masks == "predicted"
     for stage in (settings.overlap, settings.registration):
         assert (stage.epochs, stage.batch_size, stage.learning_rate) == (300, 8, 1e-4)
 

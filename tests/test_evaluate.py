@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -16,10 +17,11 @@ from dbdnet_jax.evaluation import evaluate
 from dbdnet_jax.model.config import ModelConfig
 from dbdnet_jax.model.params import Params, parameter_shapes, unflatten
 from dbdnet_jax.pair_sets import load_test_pairs
+from dbdnet_jax.recall import correspondence_rmse_m
 from dbdnet_jax.settings import Settings, read_settings
 from dbdnet_jax.weights import save_params
 from tests.data.test_modelnet40 import LABELS, write_file
-from tests.data.threedmatch_folder import write_folder
+from tests.data.threedmatch_folder import SCENES, write_folder
 
 ROOT = Path(__file__).parents[1]
 TINY = ModelConfig(
@@ -100,12 +102,22 @@ def test_scans_are_the_benchmarks_pairs_and_come_without_normals(tmp_path):
     write_folder(tmp_path)
     (tmp_path / "train.pkl").rename(tmp_path / "3DLoMatch.pkl")
     settings = cad_settings(
-        data__name="threedmatch", data__folder=str(tmp_path), protocol__points=64
+        data__name="threedmatch",
+        data__folder=str(tmp_path),
+        protocol__points=64,
+        protocol__overlap_radius=0.0375,
     )
     first, again = (load_test_pairs(settings, tmp_path / "run", "3DLoMatch") for _ in range(2))
     assert first.name == "3DLoMatch" and first.digest == again.digest
     assert first.pairs.source.points.shape == (3, 64, 3)
     assert not first.pairs.source_normals.any()
+    assert first.scans.scenes == SCENES and list(first.scans.consecutive) == [False, True, False]
+    for (source, target), i in zip(first.scans.correspondences, range(3), strict=True):
+        motion = jax.tree.map(lambda leaf, i=i: leaf[i], first.pairs.target_from_source)
+        assert (
+            source.dtype == np.float32 and 0 < correspondence_rmse_m(motion, source, target) < 0.04
+        )
+    assert [len(part) for part in first.scans.first(2)] == [2, 2, 2]
 
 
 def test_params_without_a_registration_network_are_refused(tmp_path):

@@ -46,7 +46,7 @@ def trained(stage: str, numbers: tuple[int, ...]) -> Trained:
     # In evaluation mode, as there: no dropout.
     model = dataclasses.replace(params.config, dropout=0.0)
     settings = read_settings(modelnet.get_config())
-    given = dataclasses.replace(settings.registration, true_masks=True)
+    given = dataclasses.replace(settings.registration, masks="truth")
     settings = dataclasses.replace(settings, model=model, registration=given)
     task = make_task(settings, stage, "no folder is needed")
     optimizer = optax.chain(

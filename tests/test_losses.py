@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from dbdnet_jax.losses import (
+    MATCH_WIDTH,
     LossWeights,
     focal_loss,
+    matching_loss,
     overlap_loss,
     registration_loss,
     rotation_loss,
@@ -91,12 +93,46 @@ def test_focal_loss_is_finite_at_certainty_and_zero_without_points():
     assert focal_loss(probability, label, jnp.zeros(4, bool)) == 0
 
 
+def matching_oracle(matrix, source, target, width: float) -> float:
+    """Cross-entropy with a bell of labels, or with keeping the mass where no point is near."""
+    losses = []
+    for mass, own, other in ((matrix, source, target), (matrix.T, target, source)):
+        total = 0.0
+        for row, point in zip(mass, own, strict=True):
+            squares = np.sum((other - point) ** 2, axis=1)
+            label = np.where(squares < (2.5 * width) ** 2, np.exp(-squares / (2 * width**2)), 0.0)
+            if label.any():
+                total -= np.sum(label * np.log(row)) / label.sum()
+            else:
+                total -= np.log(1 - row.sum())
+        losses.append(total / len(own))
+    return sum(losses) / 2
+
+
+def test_matching_loss_is_a_cross_entropy_over_the_points_of_both_clouds(x64):
+    rng = np.random.default_rng(5)
+    truth = Rigid(jnp.asarray(rotation_about(0, 0.6)), jnp.asarray([0.2, 0.0, -0.1]))
+    source = 0.2 * random_cloud(6, N)
+    placed = source @ np.asarray(truth.rotation).T + np.asarray(truth.translation)
+    target = np.vstack([placed[:6] + 0.02 * random_cloud(7, 6), 3.0 + random_cloud(8, M - 6)])
+    matrix = rng.random((N, M)) / (2 * N)
+    matrix[COUNT:] = np.nan
+    source[COUNT:] = np.nan
+    clouds = [Cloud(*map(jnp.asarray, x)) for x in ((source, COUNT), (target, M))]
+    value, slope = jax.value_and_grad(matching_loss)(jnp.log(matrix), *clouds, truth)
+    expected = matching_oracle(matrix[:COUNT], placed[:COUNT], target, MATCH_WIDTH)
+    assert_close(value, expected, EXACT)
+    assert_finite(slope)
+    assert not slope[COUNT:].any() and slope[:COUNT].any(axis=1).all()
+
+
 def test_overlap_loss_counts_each_cloud_half(x64):
     answer, pair = example()
     total, terms = overlap_loss(answer.src_overlap, answer.tgt_overlap, pair)
     expected = (
         focal_oracle(answer.src_overlap, pair.source_overlap, COUNT, 4.0) / 2,
         focal_oracle(answer.tgt_overlap, pair.target_overlap, M, 4.0) / 2,
+        0.0,  # this network does not match
     )
     np.testing.assert_allclose(terms, expected, rtol=1e-12)
     np.testing.assert_allclose(total, sum(expected), rtol=1e-12)

@@ -5,10 +5,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dbdnet_jax.recall import (
+    ScanRecall,
+    Scans,
     correspondence_rmse_m,
-    recall,
-    recall_table,
     rmse_within_20cm,
+    scan_recall,
+    scene_mean,
     within_15deg_30cm,
 )
 from dbdnet_jax.types import Rigid
@@ -61,46 +63,43 @@ def test_rmse_without_correspondence_or_finite_motion_is_no_success(rows):
     assert np.isnan(rmse) and not rmse_within_20cm(np.array([rmse]))[0]
 
 
-def test_scene_mean_weighs_scenes_alike():
-    scenes = ["kitchen"] * 6 + ["study"] * 2 + ["lab"]
+def test_scene_mean_weighs_scenes_alike_in_any_order():
+    scenes = np.array(["kitchen"] * 6 + ["study"] * 2 + ["lab"])
     registered = np.array([1, 1, 1, 1, 1, 1, 0, 1, 0], bool)
-    result = recall(registered, scenes)
-    assert result.by_scene == {"kitchen": 1.0, "lab": 0.0, "study": 0.5}
-    assert result.pair_mean == pytest.approx(7 / 9)
-    assert result.scene_mean == pytest.approx(0.5)
+    order = np.random.default_rng(0).permutation(9)
+    for rows in (slice(None), order):
+        assert scene_mean(registered[rows], scenes[rows]) == pytest.approx((1 + 0.5 + 0) / 3)
 
 
-def test_recall_ignores_the_order_of_pairs():
-    scenes = ["a", "b", "b", "c", "a", "c", "c"]
-    registered = np.array([1, 0, 1, 1, 0, 1, 0], bool)
-    order = np.random.default_rng(0).permutation(7)
-    assert recall(registered, scenes) == recall(registered[order], [scenes[i] for i in order])
+def scans(scenes, consecutive) -> Scans:
+    return Scans(scenes, np.array(consecutive), [])  # the RMSE is given
 
 
-def test_table_names_every_definition():
-    table = recall_table(
+def test_each_definition_and_each_mean_has_its_name():
+    found = scan_recall(
         rotation_error_deg=np.array([1.0, 20.0, 1.0]),
         translation_error_m=np.array([0.1, 0.1, 0.1]),
         rmse_m=np.array([0.3, 0.1, 0.1]),
-        scenes=["a", "b", "b"],
-        consecutive=np.array([False, True, False]),
+        scans=scans(["a", "b", "b"], [False, True, False]),
     )
-    assert table == {
-        "recall (R < 15 deg, t < 0.3 m), pair mean": pytest.approx(2 / 3),
-        "recall (R < 15 deg, t < 0.3 m), scene mean": 0.75,
-        "recall (RMSE < 0.2 m), pair mean": pytest.approx(2 / 3),
-        "recall (RMSE < 0.2 m), scene mean": 0.5,
-        "recall (RMSE < 0.2 m, fragments not consecutive), scene mean": 0.5,
-    }
+    assert found == ScanRecall(
+        recall_15deg_30cm_pair_mean=pytest.approx(2 / 3),
+        recall_15deg_30cm_scene_mean=0.75,
+        recall_rmse_20cm_pair_mean=pytest.approx(2 / 3),
+        recall_rmse_20cm_scene_mean=0.5,
+        recall_rmse_20cm_scene_mean_apart=0.5,
+    )
 
 
-def test_table_of_consecutive_fragments_only():
-    one = np.array([1.0])
-    table = recall_table(one, one, one, ["a"], np.array([True]))
-    assert len(table) == 4 and not any("not consecutive" in name for name in table)
+def test_consecutive_fragments_only():
+    one = np.array([0.1])
+    found = scan_recall(one, one, one, scans(["a"], [True]))
+    assert found.recall_rmse_20cm_scene_mean == 1.0
+    assert found.recall_rmse_20cm_scene_mean_apart is None
 
 
 @pytest.mark.parametrize(("pairs", "scenes"), [(0, []), (2, ["a"])])
 def test_recall_of_nothing_or_of_pairs_without_scene(pairs, scenes):
+    errors = np.ones(pairs)
     with pytest.raises(ValueError, match=f"got {pairs} pairs and {len(scenes)} scenes. Give"):
-        recall(np.ones(pairs, bool), scenes)
+        scan_recall(errors, errors, errors, scans(scenes, [False] * len(scenes)))

@@ -27,6 +27,7 @@ from dbdnet_jax.metrics import OverlapSummary, Summary
 from dbdnet_jax.model.config import ModelConfig
 from dbdnet_jax.model.params import Params
 from dbdnet_jax.ops import rigid
+from dbdnet_jax.recall import ScanRecall, Scans
 from dbdnet_jax.types import Branch, Cloud, Pair, Registration, Rigid
 from tests.conftest import FLOAT32, assert_close
 
@@ -100,6 +101,19 @@ def test_identity_scores_the_size_of_the_motion(pairs):
     expected = np.linalg.norm(pairs.target_from_source.translation, axis=1)
     assert_close(found.error_translation, expected.mean(), FLOAT32)
     assert_close(found.median_translation, np.median(expected), FLOAT32)
+
+
+def test_scans_have_their_registration_recall_by_either_definition(pairs):
+    corresponding = [
+        (s[:COUNT], t[:COUNT]) for s, t in zip(pairs[0].points, pairs[1].points, strict=True)
+    ]
+    scans = Scans(["a", "b", "b"], np.array([False, False, True]), corresponding)
+    oracle, identity = (
+        evaluate_method("", from_points(method), pairs, scans).recall
+        for method in (by_procrustes, classical.identity)
+    )
+    assert oracle == ScanRecall(1.0, 1.0, 1.0, 1.0, 1.0)
+    assert identity == ScanRecall(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def oracle_network(params, src, tgt, src_mask, tgt_mask) -> Registration:
@@ -180,6 +194,20 @@ def test_the_table_holds_figures_definitions_and_where_they_come_from():
         "0.125", "0.1250", "0.125", "0.1250", "0.125", "0.1250", "0.125", "0.1250",
         "12.5", "%", "12.5", "%", "0.013",
     ]  # fmt: skip
+
+
+def test_registration_recall_has_a_table_of_its_own():
+    rows = (
+        ROWS_OF_ALL_KINDS[0],
+        Row("scanned", summary(0.125), 0.5, "", ScanRecall(0.5, 0.25, 1.0, 0.125, None)),
+    )
+    _, recall = reports.render(make_evaluation(*rows)).split("registration recall")
+    for piece in ("R < 15 deg", "t < 0.3 m", "RMSE", "< 0.2 m", "pair mean", "scene mean", "apart"):
+        assert piece in recall
+    cells = {line.split()[0]: line.split()[1:] for line in recall.splitlines() if line}
+    assert cells["scanned"] == ["50.0", "%", "25.0", "%", "100.0", "%", "12.5", "%", "-"]
+    assert cells["ICP"] == ["-"] * 5
+    assert "registration recall" not in reports.render(make_evaluation(*ROWS_OF_ALL_KINDS))
 
 
 def test_without_overlap_predictions_there_is_one_table():

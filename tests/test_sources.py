@@ -40,6 +40,13 @@ def test_cad_shapes_are_those_of_the_training_and_validation_splits():
     assert list(validation.paths) == list(cad_split("val", "seen").paths)
 
 
+def test_procedural_shapes_are_trained_on_beside_the_others():
+    train, _ = load_training_shapes(DataSettings("cad", "", "seen"))
+    more, _ = load_training_shapes(DataSettings("cad", "", "seen", procedural=3))
+    assert len(more) == len(train) + 3 and set(more.libraries[-3:]) == {"procedural"}
+    np.testing.assert_array_equal(more.points[: len(train)], train.points)
+
+
 def test_every_twentieth_modelnet_shape_is_held_out(tmp_path):
     for number, name in enumerate(FILES["train"]):
         write_file(tmp_path / name, range(9), number)

@@ -1,6 +1,7 @@
 """Both stages with a tiny network, on shapes that the test makes."""
 
 import csv
+import dataclasses
 import itertools
 
 import jax
@@ -13,8 +14,9 @@ from dbdnet_jax.safe_pickle import CheckpointError
 from dbdnet_jax.settings import Settings, read_settings
 from dbdnet_jax.sources import Source, shape_source
 from dbdnet_jax.training import fit
+from dbdnet_jax.weights import save_params
 from tests import stand_in
-from tests.conftest import EXACT, assert_close, assert_finite
+from tests.conftest import EXACT, Tolerance, assert_close, assert_finite
 
 
 def settings() -> Settings:
@@ -22,6 +24,8 @@ def settings() -> Settings:
     config = cad.get_config()
     config.model.overlap_channels = config.model.registration_channels = 4
     config.model.overlap_blocks = 1
+    config.model.overlap_passes = 1  # more start from another random motion in every step
+    config.model.iterations = 1
     config.model.heads = 2
     config.model.neighbours = 4
     config.model.min_points = 12
@@ -36,6 +40,7 @@ def settings() -> Settings:
     config.train.validate_every = 6
     config.train.validation_pairs = 2
     config.overlap.epochs = config.registration.epochs = 3.0
+    config.registration.masks = "predicted"
     return read_settings(config)
 
 
@@ -93,6 +98,38 @@ def test_a_stopped_second_stage_ends_as_an_unbroken_one(run_dir, tmp_path):
     jax.tree.map(lambda a, b: assert_close(a, b, EXACT), found, expected)
     for name in ("registration/train.csv", "registration/validation.csv"):
         assert (tmp_path / name).read_bytes() == (run_dir / name).read_bytes()
+
+
+@pytest.mark.parametrize("stage", ["overlap", "registration"])
+def test_networks_of_several_passes_go_on_from_weights(run_dir, tmp_path, stage):
+    weights = tmp_path / "weights.npz"
+    save_params(weights, load_best(run_dir))
+    settings = dataclasses.replace(
+        SETTINGS,
+        model=dataclasses.replace(SETTINGS.model, overlap_passes=2, iterations=2),
+        train=dataclasses.replace(SETTINGS.train, start=str(weights), learning_rate=1e-5),
+        overlap=dataclasses.replace(SETTINGS.overlap, learning_rate=1e-5),
+        registration=dataclasses.replace(
+            SETTINGS.registration, learning_rate=1e-5, masks="imperfect"
+        ),
+    )
+    fit(settings, stage, tmp_path, source())
+    found, start = (getattr(load_best(folder), stage) for folder in (tmp_path, run_dir))
+    jax.tree.map(lambda a, b: assert_close(a, b, Tolerance(rtol=0.0, atol=1e-3)), found, start)
+    moved = jax.tree.leaves(jax.tree.map(lambda a, b: bool((a != b).any()), found, start))
+    assert np.mean(moved) > 0.9
+
+
+def test_weights_of_another_width_are_no_start(run_dir, tmp_path):
+    weights = tmp_path / "weights.npz"
+    save_params(weights, load_best(run_dir))
+    settings = dataclasses.replace(
+        SETTINGS,
+        model=dataclasses.replace(SETTINGS.model, overlap_channels=8),
+        train=dataclasses.replace(SETTINGS.train, start=str(weights)),
+    )
+    with pytest.raises(CheckpointError, match="misshapen: overlap/.*config.train.start=''"):
+        fit(settings, "overlap", tmp_path, source())
 
 
 def test_a_shape_with_nan_stops_the_overlap_stage(tmp_path):

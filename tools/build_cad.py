@@ -18,61 +18,12 @@ from pathlib import Path
 
 import numpy as np
 from cad_archives import Library, Model, parse_obj, read_library
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
-CANDIDATES = 3072  # drawn by area; farthest-point sampling then keeps KEPT of them
-KEPT = 2048
+from dbdnet_jax.data.surface import KEPT, even_points
+
 POINT_SCALE = 32767  # int16 at the largest norm 1: a step of 3e-5
 NORMAL_SCALE = 127  # int8: a step of 0.5 degrees
-
-
-def sample_surface(
-    vertices: Float[np.ndarray, "v 3"],
-    triangles: Int[np.ndarray, "t 3"],
-    count: int,
-    rng: np.random.Generator,
-) -> tuple[Float[np.ndarray, "count 3"], Float[np.ndarray, "count 3"]]:
-    """Independent points on the surface, uniform by area, and their unit face normals.
-
-    Degenerate triangles are skipped. The side a normal points to is the winding of the mesh.
-
-    Raises:
-        ValueError: no triangle has an area.
-    """
-    first, second, third = (vertices[triangles[:, corner]] for corner in range(3))
-    normals = np.cross(second - first, third - first)
-    areas = np.sqrt((normals**2).sum(-1))
-    extent = np.ptp(vertices, axis=0).max() if len(vertices) else 0.0
-    proper = areas > 1e-12 * extent**2
-    if not proper.any():
-        raise ValueError(
-            f"a model must have a triangle with an area; got {len(triangles)} triangles, all "
-            "degenerate. The OBJ file is damaged: install the archive again."
-        )
-    first, second, third = first[proper], second[proper], third[proper]
-    normals = normals[proper] / areas[proper, None]
-    edges = np.cumsum(areas[proper])
-    face = np.searchsorted(edges, rng.random(count) * edges[-1], side="right")
-    face = np.minimum(face, len(edges) - 1)
-    root = np.sqrt(rng.random(count))[:, None]
-    along = rng.random(count)[:, None]
-    points = (
-        (1 - root) * first[face] + root * (1 - along) * second[face] + root * along * third[face]
-    )
-    return points, normals[face]
-
-
-def farthest_points(points: Float[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, " count"]:
-    """Rows chosen by farthest-point sampling from row 0, in the order of choice."""
-    x, y, z = np.ascontiguousarray(points.T)
-    chosen = np.zeros(count, dtype=np.int64)
-    nearest = np.full(len(points), np.inf)
-    for step in range(1, count):
-        last = chosen[step - 1]
-        distance = (x - x[last]) ** 2 + (y - y[last]) ** 2 + (z - z[last]) ** 2
-        np.minimum(nearest, distance, out=nearest)
-        chosen[step] = nearest.argmax()
-    return chosen
 
 
 def sample_model(
@@ -80,19 +31,14 @@ def sample_model(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points (2048, 3) int16 and normals (2048, 3) int8 of one OBJ file.
 
-    The centroid of the points is the origin and the largest norm 1, before the rounding. The rows
-    keep the order they were drawn in, so that the first 1024 are a fair half of the shape.
+    The centroid of the points is the origin and the largest norm 1, before the rounding.
     """
     vertices, triangles = parse_obj(text)
     if rotation is not None:
         vertices = (vertices[:, None, :] * rotation).sum(-1)
     seed = int.from_bytes(hashlib.sha256(key.encode()).digest()[:16], "big")
     rng = np.random.Generator(np.random.PCG64(seed))
-    points, normals = sample_surface(vertices, triangles, CANDIDATES, rng)
-    rows = np.sort(farthest_points(points, KEPT))
-    points, normals = points[rows], normals[rows]
-    points = points - points.mean(0)
-    points = points / np.sqrt((points**2).sum(-1).max())
+    points, normals = even_points(vertices, triangles, rng)
     return (
         np.rint(points * POINT_SCALE).astype(np.int16),
         np.rint(normals * NORMAL_SCALE).astype(np.int8),

@@ -137,6 +137,65 @@ def assemble(
     )
 
 
+def imperfect_motion(
+    key: PRNGKeyArray, pair: Pair, max_angle_deg: float, shift_sigma: float
+) -> Rigid:
+    """The true motion, then a turn about the source's centroid and a shift.
+
+    Both grow with one uniform number, up to the angle and the shift's deviation per component.
+    Clouds without padding only.
+    """
+    amount_key, direction_key = jax.random.split(key)
+    amount = jax.random.uniform(amount_key)
+    axis, shift = jax.random.normal(direction_key, (2, 3))
+    turn = rigid.rotation_about(axis / jnp.linalg.norm(axis), amount * math.radians(max_angle_deg))
+    centre = jnp.mean(rigid.apply(pair.target_from_source, pair.source.points), axis=0)
+    shift = centre - turn @ centre + amount * shift_sigma * shift
+    return rigid.compose(Rigid(turn, shift), pair.target_from_source)
+
+
+def starting_motion(key: PRNGKeyArray, pair: Pair) -> Rigid:
+    """What a pass of a network may start from: nothing but aligned centroids, or the pose roughly.
+
+    Two in five pairs start from the centroids, the others up to 40 degrees and 0.2 off.
+    """
+    choice_key, motion_key = jax.random.split(key)
+    roughly = imperfect_motion(motion_key, pair, max_angle_deg=40.0, shift_sigma=0.2)
+    shift = jnp.mean(pair.target.points, axis=0) - jnp.mean(pair.source.points, axis=0)
+    blind = jax.random.uniform(choice_key) < 0.4
+    return jax.tree.map(
+        lambda a, b: jnp.where(blind, a, b), Rigid(jnp.eye(3, dtype=shift.dtype), shift), roughly
+    )
+
+
+def imperfect_overlap(
+    key: PRNGKeyArray, pair: Pair, overlap_radius: float
+) -> tuple[Bool[Array, " n"], Bool[Array, " m"]]:
+    """Overlap labels as wrong as a network's may be, more in one pair than in another.
+
+    A fifth are the true ones and a fifth say that every point overlaps. The others are the labels
+    under an imperfect motion: in parts too many points, in parts too few.
+    """
+    choice_key, motion_key = jax.random.split(key)
+    choice = jax.random.uniform(choice_key)
+    motion = imperfect_motion(motion_key, pair, max_angle_deg=30.0, shift_sigma=0.1)
+    aligned = rigid.apply(motion, pair.source.points)
+    labels = _overlap_labels(aligned, pair.target.points, overlap_radius)
+    truth = pair.source_overlap, pair.target_overlap
+    source, target = (
+        jnp.where(choice < 0.2, true, (choice < 0.4) | label)
+        for true, label in zip(truth, labels, strict=True)
+    )
+    return source, target
+
+
+def moved_pair(pair: Pair, motion: Rigid) -> Pair:
+    """The same pair with the source moved already."""
+    source = pair.source._replace(points=rigid.apply(motion, pair.source.points))
+    rest = rigid.compose(pair.target_from_source, rigid.invert(motion))
+    return pair._replace(source=source, target_from_source=rest)
+
+
 def _overlap_labels(
     aligned: Float[Array, "n 3"], target: Float[Array, "m 3"], radius: float
 ) -> tuple[Bool[Array, " n"], Bool[Array, " m"]]:

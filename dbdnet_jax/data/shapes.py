@@ -38,3 +38,10 @@ def select(shapes: Shapes, index: Int[np.ndarray, " k"] | Bool[np.ndarray, " s"]
     """The shapes at ``index`` (rows, or a mask over all), as a copy."""
     fields = dataclasses.fields(shapes)
     return Shapes(**{field.name: getattr(shapes, field.name)[index] for field in fields})
+
+
+def joined(first: Shapes, second: Shapes) -> Shapes:
+    """Both sets as one, the first one first."""
+    fields = [field.name for field in dataclasses.fields(first)]
+    pairs = {name: (getattr(first, name), getattr(second, name)) for name in fields}
+    return Shapes(**{name: np.concatenate(both) for name, both in pairs.items()})

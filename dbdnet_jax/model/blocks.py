@@ -45,9 +45,14 @@ def dense(affine: Affine, x: Float[Array, "n c"]) -> Float[Array, "n d"]:
 class Norm(nn.Module):
     """Scale and bias of a group normalisation, and how statistics become one affine map."""
 
+    features: int
     groups: int
 
-    @nn.compact
+    def setup(self):
+        """Declare both."""
+        self.scale = self.param("scale", nn.initializers.ones, (self.features,))
+        self.bias = self.param("bias", nn.initializers.zeros, (self.features,))
+
     def __call__(
         self, mean: Float[Array, " c"], variance: Float[Array, " c"]
     ) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
@@ -56,9 +61,7 @@ class Norm(nn.Module):
         A group's variance is the mean of its channels' variances plus the variance of their
         means (Wu & He 2018).
         """
-        channels, dtype = mean.shape[0], mean.dtype
-        scale = self.param("scale", nn.initializers.ones, (channels,)).astype(dtype)
-        bias = self.param("bias", nn.initializers.zeros, (channels,)).astype(dtype)
+        scale, bias = self.scale.astype(mean.dtype), self.bias.astype(mean.dtype)
         mean, variance = mean.reshape(self.groups, -1), variance.reshape(self.groups, -1)
         centre = jnp.mean(mean, axis=1, keepdims=True)
         spread = jnp.mean(variance + (mean - centre) ** 2, axis=1, keepdims=True)
@@ -83,7 +86,8 @@ class DenseNorm(nn.Module):
         weight = valid.astype(x.dtype) / jnp.maximum(jnp.sum(valid), 1).astype(x.dtype)
         mean = weight @ x
         centred = jnp.where(valid[:, None], x - mean[None, :], 0.0)
-        slope, offset = Norm(self.groups, name="norm")(mean, weight @ (centred * centred))
+        norm = Norm(self.features, self.groups, name="norm")
+        slope, offset = norm(mean, weight @ (centred * centred))
         return nn.relu(x * slope[None, :] + offset[None, :])
 
 

@@ -15,6 +15,7 @@ class ModelConfig:
 
     overlap_channels: int = 64  # encoder width at the finest level; its feature is 4 x as wide
     overlap_blocks: int = 4
+    overlap_matching: bool = False  # whether the overlap head sees soft matches: not in the paper
     registration_channels: int = 32
     shared_blocks: int = 3
     rotation_blocks: int = 3
@@ -25,6 +26,9 @@ class ModelConfig:
     parameter_width: int = 1024  # of the parameter network's global feature
     neighbours: int = 20  # k of every neighbour search
     neighbour_space: str = "feature"  # or "coordinates": one search per level, shared
+    overlap_passes: int = 1  # more: each one starts from the motion that the last one's matches ask
+    overlap_points: int = 0  # that the overlap network sees, farthest first; 0: all
+    registration_points: int = 0  # of the selected ones, that are matched; 0: all
     overlap_threshold: float = 0.5
     min_points: int = 160  # the most probable rows kept when fewer pass the threshold
     iterations: int = 1
@@ -56,9 +60,28 @@ class ModelConfig:
                     f"{name} must be a positive multiple of 128 (its layers halve it, and their "
                     f"group norms have up to 16 groups); got {getattr(self, name)}. Use 128."
                 )
-        for name in ("neighbours", "min_points", "iterations", "sinkhorn_iterations", "heads"):
+        if self.overlap_passes > 1 and not self.overlap_matching:
+            raise ValueError(
+                "overlap_passes must be 1 without overlap_matching, which gives the motion that "
+                f"the next pass starts from; got {self.overlap_passes}. Set overlap_matching=True."
+            )
+        counts = ("overlap_passes", "iterations", "sinkhorn_iterations", "neighbours", "min_points")
+        for name in (*counts, "heads"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}.")
+        for name in ("overlap_points", "registration_points"):
+            points = getattr(self, name)
+            if points < 0 or (points and self.released):
+                raise ValueError(
+                    f"{name} must be 0 (all points) or positive, and 0 where released=True (the "
+                    f"released network has no such limit); got {points}, released="
+                    f"{self.released}. Use 0."
+                )
+        if self.overlap_matching and self.released:
+            raise ValueError(
+                "overlap_matching must be False where released=True: the released network has no "
+                "such part; got True. Set one of the two to False."
+            )
         if not 0.0 <= self.dropout < 1.0:
             raise ValueError(f"dropout must be in [0, 1); got {self.dropout}.")
 

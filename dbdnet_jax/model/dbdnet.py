@@ -5,12 +5,24 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from dbdnet_jax.model.config import ModelConfig
+from dbdnet_jax.model.matching import Matched, soft_targets
 from dbdnet_jax.model.overlap import OverlapNetwork
 from dbdnet_jax.model.params import Params
 from dbdnet_jax.model.registration import RegistrationNetwork
+from dbdnet_jax.model.stack import (
+    centred,
+    first_rows,
+    grow,
+    move_source,
+    prepare,
+    stack_clouds,
+    stack_masked,
+    uncentred,
+)
 from dbdnet_jax.ops import rigid
+from dbdnet_jax.ops.grouping import interpolate, interpolation_weights
 from dbdnet_jax.ops.rigid import HIGHEST
-from dbdnet_jax.ops.sampling import farthest_order, inverse_order, prefix_mask, prefix_order
+from dbdnet_jax.ops.sampling import inverse_order, prefix_mask, prefix_order
 from dbdnet_jax.types import Branch, Cloud, Registration, Rigid
 
 
@@ -34,8 +46,8 @@ def register(
             "register needs a registration network; these params hold only the overlap network. "
             "Use predict_overlap, or load a full checkpoint."
         )
-    clouds, order = _stack(src, tgt, src_mask, tgt_mask)
-    probability = _overlap(params, clouds)
+    clouds, order = stack_masked(src, tgt, src_mask, tgt_mask)
+    probability, _ = _overlap(params, clouds)
     return _register(params, clouds, order, probability, (src.shape[0], tgt.shape[0]))
 
 
@@ -49,9 +61,25 @@ def predict_overlap(
 
     With a ``dropout_key``, attention weights are dropped as in training.
     """
-    clouds = _stack_clouds(source, target)
-    probability = _overlap(params, clouds, dropout_key)
-    return probability[0, : source.points.shape[0]], probability[1, : target.points.shape[0]]
+    return predict_overlap_and_matches(params, source, target, dropout_key)[:2]
+
+
+def predict_overlap_and_matches(
+    params: Params,
+    source: Cloud,
+    target: Cloud,
+    dropout_key: PRNGKeyArray | None = None,
+    start: Rigid | None = None,
+) -> tuple[Float[Array, " n"], Float[Array, " m"], Matched | None]:
+    """`predict_overlap`, and the soft matches of a network that has them (else None).
+
+    With a ``start``, a first idea of the motion, one pass from there instead of
+    `ModelConfig.overlap_passes` from the clouds with their centroids aligned.
+    """
+    clouds = stack_clouds(source, target)
+    probability, matched = _overlap(params, clouds, dropout_key, start)
+    sizes = source.points.shape[0], target.points.shape[0]
+    return probability[0, : sizes[0]], probability[1, : sizes[1]], matched
 
 
 def register_given_overlap(
@@ -66,71 +94,45 @@ def register_given_overlap(
 
     Stage 2 of training, and the way to use a mask of one's own: 0 and 1 are probabilities too.
     """
-    clouds = _stack_clouds(source, target)
+    clouds = stack_clouds(source, target)
     sizes = (source.points.shape[0], target.points.shape[0])
     size = clouds.points.shape[1]
     order = jnp.broadcast_to(jnp.arange(size), (2, size))
-    probability = jnp.stack([_grow(source_overlap, size), _grow(target_overlap, size)])
+    probability = jnp.stack([grow(source_overlap, size), grow(target_overlap, size)])
     return _register(params, clouds, order, probability, sizes, dropout_key)
 
 
-def _grow(x: jax.Array, size: int) -> jax.Array:
-    """Pad the rows of ``x`` with zeros to ``size``."""
-    return jnp.pad(x, [(0, size - x.shape[0])] + [(0, 0)] * (x.ndim - 1))
+def _overlap(
+    params: Params, clouds: Cloud, dropout_key=None, start: Rigid | None = None
+) -> tuple[Float[Array, "2 n"], Matched | None]:
+    """Overlap probabilities in the clouds' own row order, and matches in their own frames."""
+    config = params.config
+    ordered, order, skip_rows, centroid = prepare(clouds, config, config.overlap_points)
+    seen = first_rows(ordered, config.overlap_points)
+    network = OverlapNetwork(config)
 
+    def one_pass(motion, _):
+        moved = move_source(seen, motion)
+        variables = {"params": params.overlap}
+        logits, matched = network.apply(variables, moved, skip_rows, dropout_key)
+        if matched is not None:
+            motion = rigid.compose(matched.motion, motion)
+        return motion, (logits, matched)
 
-def _stack_clouds(source: Cloud, target: Cloud) -> Cloud:
-    """Two clouds of any static sizes as one stack; padding, as everywhere, changes nothing."""
-    size = max(source.points.shape[0], target.points.shape[0])
-    points = jnp.stack([_grow(source.points, size), _grow(target.points, size)])
-    points = points.astype(jnp.promote_types(points.dtype, jnp.float32))
-    return Cloud(points, jnp.stack([jnp.asarray(source.count), jnp.asarray(target.count)]))
-
-
-def _stack(src, tgt, src_mask, tgt_mask) -> tuple[Cloud, Int[Array, "2 n"]]:
-    """Stack two clouds with masks; ``order[c, row]`` is the caller's row of a stacked row."""
-    size = max(src.shape[0], tgt.shape[0])
-    masks = [
-        _grow(jnp.ones(x.shape[0], bool) if mask is None else mask, size)
-        for x, mask in ((src, src_mask), (tgt, tgt_mask))
-    ]
-    keep = jnp.stack(masks)
-    order = jax.vmap(prefix_order)(keep)
-    source, target = (Cloud(x, jnp.asarray(x.shape[0])) for x in (src, tgt))
-    points = jnp.take_along_axis(_stack_clouds(source, target).points, order[..., None], axis=1)
-    return Cloud(points, jnp.sum(keep, axis=1)), order
-
-
-def _prepare(clouds: Cloud, config: ModelConfig):
-    """Centre both clouds and bring them into farthest-point order.
-
-    Returns the clouds, the order, the released code's rows for query-down, and the centroids.
-    What stands in the padding is overwritten, so that it cannot matter from here on.
-    """
-    size = clouds.points.shape[1]
-    valid = jax.vmap(lambda count: prefix_mask(size, count))(clouds.count)[..., None]
-    points = jnp.where(valid, clouds.points, 0.0)
-    centroid = jnp.sum(points, axis=1) / jnp.maximum(clouds.count, 1)[:, None]
-    if config.released:
-        centroid = jnp.zeros_like(centroid)  # departure: the released network sees raw coordinates
-    points = jnp.where(valid, points - centroid[:, None, :], 0.0)
-    order = jax.lax.map(
-        lambda cloud: farthest_order(*cloud), (jax.lax.stop_gradient(points), clouds.count)
-    )
-    ordered = Cloud(jnp.take_along_axis(points, order[..., None], axis=1), clouds.count)
-    skip_rows = jax.vmap(inverse_order)(order) if config.released else None
-    return ordered, order, skip_rows, centroid
-
-
-def _overlap(params: Params, clouds: Cloud, dropout_key=None) -> Float[Array, "2 n"]:
-    """Overlap probabilities in the clouds' own row order."""
-    ordered, order, skip_rows, _ = _prepare(clouds, params.config)
-    network = OverlapNetwork(params.config)
-    logits = jnp.asarray(network.apply({"params": params.overlap}, ordered, skip_rows, dropout_key))
-    size = logits.shape[1]
+    passes = config.overlap_passes if start is None else 1
+    motion = rigid.identity(seen.points.dtype) if start is None else centred(start, centroid)
+    motion, answers = jax.lax.scan(one_pass, motion, length=passes)
+    logits, matched = jax.tree.map(lambda leaf: leaf[-1], answers)
+    size = ordered.points.shape[1]
+    if logits.shape[1] < size:
+        nearest = jax.vmap(interpolation_weights)(ordered.points, seen.points, seen.count)
+        logits = jax.vmap(interpolate)(logits[..., None], *nearest)[..., 0]
     valid = jax.vmap(lambda count: prefix_mask(size, count))(clouds.count)
     logits = jnp.take_along_axis(logits, jax.vmap(inverse_order)(order), axis=1)
-    return jnp.where(valid, jax.nn.sigmoid(logits), 0.0)
+    if matched is not None:
+        own = seen._replace(points=seen.points + centroid[:, None, :])
+        matched = matched._replace(clouds=own, motion=uncentred(motion, centroid))
+    return jnp.where(valid, jax.nn.sigmoid(logits), 0.0), matched
 
 
 def select(
@@ -157,6 +159,11 @@ def _register(params, clouds, order, probability, sizes, dropout_key=None) -> Re
     )(jax.lax.stop_gradient(probability), clouds.count)
     kept = Cloud(jnp.take_along_axis(clouds.points, chosen[..., None], axis=1), count)
     motion, correspondence, targets, sampled, solvable = _iterate(params, kept, dropout_key)
+    seen = targets.shape[1]
+    count = jnp.minimum(count, seen)
+    beyond = kept.points.shape[1] - seen
+    correspondence = jnp.pad(correspondence, ((0, 0), (0, beyond), (0, beyond)))
+    targets = jnp.pad(targets, ((0, 0), (0, beyond), (0, 0)))
     # Row r of the network is row `back[c, r]` of the caller's cloud c.
     back = jnp.take_along_axis(jnp.take_along_axis(order, chosen, axis=1), sampled, axis=1)
     from_caller = jax.vmap(inverse_order)(back)
@@ -192,21 +199,29 @@ def _iterate(params: Params, kept: Cloud, dropout_key):
     config = params.config
     network = RegistrationNetwork(config)
     variables = {"params": params.registration}
-    motion = rigid.identity(kept.points.dtype)
-    features = None
-    for step in range(config.iterations):
-        key = None if dropout_key is None else jax.random.fold_in(dropout_key, step)
-        moved = kept._replace(points=kept.points.at[0].set(rigid.apply(motion, kept.points[0])))
-        ordered, order, skip_rows, centroid = _prepare(moved, config)
-        if features is None or not config.released:
-            # Departure of the released code: features of the unmoved source serve all iterations.
+    unmoved = None
+    if config.released:
+        # Departure: features of the unmoved source serve all iterations.
+        ordered, _, skip_rows, _ = prepare(kept, config, 0)
+        unmoved = network.apply(variables, ordered, skip_rows, method="encode")
+
+    def iterate(motion, key):
+        moved = move_source(kept, motion)
+        ordered, order, skip_rows, centroid = prepare(moved, config, config.registration_points)
+        ordered, features = first_rows(ordered, config.registration_points), unmoved
+        if features is None:
             features = network.apply(variables, ordered, skip_rows, method="encode")
         matrix = jnp.asarray(network.apply(variables, ordered, features, key, method="match"))
         increment, targets, solvable = _solve(matrix, ordered, centroid, config)
-        # The released code returns the last increment instead of the composed motion.
-        total = rigid.compose(increment, motion)
-        motion = increment if config.released and step == config.iterations - 1 else total
-    return motion, matrix, targets, order, solvable
+        motion = rigid.compose(increment, motion)
+        return motion, (increment, matrix, targets, order, solvable)
+
+    keys = None if dropout_key is None else jax.random.split(dropout_key, config.iterations)
+    start = rigid.identity(kept.points.dtype)
+    motion, steps = jax.lax.scan(iterate, start, keys, length=config.iterations)
+    increment, matrix, targets, order, solvable = jax.tree.map(lambda leaf: leaf[-1], steps)
+    # Departure: the released code returns the last increment instead of the composed motion.
+    return increment if config.released else motion, matrix, targets, order, solvable
 
 
 def _solve(
@@ -220,21 +235,17 @@ def _solve(
     The soft targets are returned in the target's own frame, centring undone.
     """
     source, target = ordered.points
-    mass = jnp.sum(matrix, axis=2)
-    soft = jnp.matmul(matrix, target, precision=HIGHEST)
     if config.released:
         # Departure: not divided by the row's mass, so slack pulls points to the origin, and every
         # kept row weighs the same.
+        soft = jnp.matmul(matrix, target, precision=HIGHEST)
         valid = prefix_mask(source.shape[0], ordered.count[0]).astype(source.dtype)
-        weights = jnp.broadcast_to(valid, mass.shape)
+        weights = jnp.broadcast_to(valid, matrix.shape[:2])
     else:
-        soft = soft / jnp.where(mass > 1e-12, mass, 1.0)[..., None]
-        weights = mass
+        soft, weights = jax.vmap(soft_targets, in_axes=(0, None))(matrix, target)
     of_rotation, singular = rigid.procrustes(source, soft[0], weights[0])
     of_translation, _ = rigid.procrustes(source, soft[1], weights[1])
-    rotation = of_rotation.rotation
-    translation = of_translation.translation + centroid[1]
-    translation = translation - jnp.matmul(rotation, centroid[0], precision=HIGHEST)
-    finite = jnp.all(jnp.isfinite(rotation)) & jnp.all(jnp.isfinite(translation))
+    motion = uncentred(Rigid(of_rotation.rotation, of_translation.translation), centroid)
+    finite = jnp.all(jnp.isfinite(motion.rotation)) & jnp.all(jnp.isfinite(motion.translation))
     determined = (singular[1] > 1e-6) & jnp.all(jnp.sum(weights, axis=1) > 1e-6)
-    return Rigid(rotation, translation), soft + centroid[None, 1:], finite & determined
+    return motion, soft + centroid[None, 1:], finite & determined

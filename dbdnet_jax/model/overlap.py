@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from dbdnet_jax.model.blocks import Affine, AttentionBlock, DenseNorm, dense, over_clouds
 from dbdnet_jax.model.config import ModelConfig
 from dbdnet_jax.model.encoder import Encoder
+from dbdnet_jax.model.matching import Matched, Matching, fit_features
 from dbdnet_jax.ops.attention import position_code
 from dbdnet_jax.ops.grouping import masked_max
 from dbdnet_jax.ops.sampling import prefix_mask
@@ -25,11 +26,11 @@ class OverlapNetwork(nn.Module):
         clouds: Cloud,
         skip_rows: Int[Array, "2 n"] | None = None,
         dropout_key: PRNGKeyArray | None = None,
-    ) -> Float[Array, "2 n"]:
+    ) -> tuple[Float[Array, "2 n"], Matched | None]:
         """Logits of the points of two clouds, stacked, each in farthest-point order.
 
-        Rows past a cloud's count hold logits without meaning. Without a ``dropout_key`` the
-        network is deterministic.
+        With ``overlap_matching`` also the soft matches that they follow from. Rows past a cloud's
+        count hold logits without meaning. Without a ``dropout_key`` the network is deterministic.
         """
         config = self.config
         encoder = Encoder(
@@ -47,8 +48,13 @@ class OverlapNetwork(nn.Module):
             features = attend(features, valid, key)
         pooled = jax.vmap(masked_max)(features, valid)[::-1]  # of the other cloud
         other = jnp.broadcast_to(pooled[:, None, :], features.shape)
-        features = jnp.concatenate([features, other], axis=-1)
+        seen, matched = [features, other], None
+        if config.overlap_matching:
+            matched = Matching(config.sinkhorn_iterations, name="matching")(clouds, features)
+            seen.append(fit_features(matched))
+        features = jnp.concatenate(seen, axis=-1)
         for layer, (size, groups) in enumerate(config.head_layers):
             decode = DenseNorm(size, groups, name=f"decoder_{layer}")
             features = over_clouds(decode, features, valid)
-        return dense(Affine(1, name="linear"), features.reshape(2 * n, -1)).reshape(2, n)
+        logits = dense(Affine(1, name="linear"), features.reshape(2 * n, -1)).reshape(2, n)
+        return logits, matched

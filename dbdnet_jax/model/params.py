@@ -1,5 +1,6 @@
 """The parameters of both networks, the architecture they fit, and their initial values."""
 
+import math
 from collections.abc import Collection, Mapping
 from typing import Any
 
@@ -11,6 +12,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from jaxtyping import PRNGKeyArray
 
 from dbdnet_jax.model.config import ModelConfig
+from dbdnet_jax.model.matching import FIT_FEATURES
 from dbdnet_jax.ops.pyramid import LEVELS
 from dbdnet_jax.safe_pickle import CheckpointError
 
@@ -38,7 +40,7 @@ def init_params(key: PRNGKeyArray, config: ModelConfig) -> Params:
     One draw serves the whole network: a random operation per parameter takes minutes to compile.
     """
     shapes = parameter_shapes(config)
-    ends = np.cumsum([np.prod(shape) for shape in shapes.values()])
+    ends = np.cumsum([math.prod(shape) for shape in shapes.values()])
     uniform = np.asarray(jax.random.uniform(key, (int(ends[-1]),), minval=-1.0))
     draws = np.split(uniform, ends[:-1])
     arrays = {
@@ -47,6 +49,11 @@ def init_params(key: PRNGKeyArray, config: ModelConfig) -> Params:
         else draw.reshape(shape) * np.float32(_bound(name, shapes))
         for (name, shape), draw in zip(shapes.items(), draws, strict=True)
     }
+    if config.overlap_matching:
+        # Fresh features, normalised, lie about sqrt(2 width) apart: soft matches, half of the mass.
+        width = 4 * config.overlap_channels
+        arrays["overlap/matching/alpha"] = np.array(1.5 * width, np.float32)
+        arrays["overlap/matching/beta"] = np.array(math.log(math.expm1(4.0 / width)), np.float32)
     return unflatten(arrays, config)
 
 
@@ -76,7 +83,11 @@ def parameter_shapes(config: ModelConfig, networks: Collection[str] = NETWORKS) 
         width = 4 * config.overlap_channels
         _encoder(shapes, "overlap/encoder", config.overlap_channels)
         _blocks(shapes, "overlap/attention", config.overlap_blocks, width)
-        last = _layers(shapes, "overlap/decoder", 2 * width, config.head_layers)
+        fan_in = 2 * width
+        if config.overlap_matching:
+            shapes |= {"overlap/matching/alpha": (), "overlap/matching/beta": ()}
+            fan_in += FIT_FEATURES
+        last = _layers(shapes, "overlap/decoder", fan_in, config.head_layers)
         _affine(shapes, "overlap/linear", last, 1)
     if "registration" in networks:
         width = 4 * config.registration_channels

@@ -50,6 +50,14 @@ def rotation_from_euler(angles: Float[Array, "3"]) -> Float[Array, "3 3"]:
     )
 
 
+def rotation_about(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "3 3"]:
+    """Rotation about a unit axis by an angle in radians (Rodrigues' formula)."""
+    x, y, z = axis
+    cross = jnp.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], axis.dtype)
+    square = jnp.matmul(cross, cross, precision=HIGHEST)
+    return jnp.eye(3, dtype=axis.dtype) + jnp.sin(angle) * cross + (1 - jnp.cos(angle)) * square
+
+
 def random_rigid(key: PRNGKeyArray, max_angle: float, max_translation: float) -> Rigid:
     """A motion with Euler angles in [-max_angle, max_angle] (radians) and bounded translation.
 

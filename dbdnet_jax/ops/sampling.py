@@ -21,23 +21,26 @@ def inverse_order(order: Int[Array, " n"]) -> Int[Array, " n"]:
     return jnp.zeros_like(order).at[order].set(rows)
 
 
-def farthest_order(points: Float[Array, "n 3"], count: Int[Array, ""]) -> Int[Array, " n"]:
-    """A row order whose first ``count // 2`` rows are farthest-point samples from row 0.
+def farthest_order(
+    points: Float[Array, "n 3"], count: Int[Array, ""], size: int = 0
+) -> Int[Array, " n"]:
+    """A row order whose first rows are farthest-point samples from row 0.
 
-    Each next row is the valid point farthest from all rows before it (Gonzalez 1985; the lower
-    row on ties). The other valid rows follow in their given order, then the padding. The sampling
-    is greedy, so the first rows of the reordered cloud are farthest-point samples of any longer
-    prefix too: in this order every level of a pyramid is a prefix. Clouds of fewer than four
-    points keep their order.
+    As many as ``count // 2``, and ``size`` where that is more and there are as many. Each next row
+    is the valid point farthest from all rows before it (Gonzalez 1985; the lower row on ties). The
+    other valid rows follow in their given order, then the padding. The sampling is greedy, so the
+    first rows of the reordered cloud are farthest-point samples of any longer prefix too: in this
+    order every level of a pyramid is a prefix. Clouds of fewer than four points keep their order.
     """
     n = points.shape[0]
     rows = jnp.arange(n)
+    sampled = jnp.maximum(count // 2, jnp.minimum(count, size))
     # Padding starts below every distance, so that it is never the farthest.
     start = jnp.where(rows < count, jnp.inf, -1.0).astype(points.dtype)
 
     def step(i, carry):
         distance, last, rank = carry
-        rank = rank.at[last].set(jnp.where(i < count // 2, i, rank[last]))
+        rank = rank.at[last].set(jnp.where(i < sampled, i, rank[last]))
         offset = points - points[last][None, :]
         offset = jnp.sum(offset * offset, axis=-1)
         # A row once taken must not be taken again, even among duplicates at distance zero.
@@ -45,7 +48,8 @@ def farthest_order(points: Float[Array, "n 3"], count: Int[Array, ""]) -> Int[Ar
         return distance, jnp.argmax(distance), rank
 
     rank = jnp.where(rows < count, n + rows, 2 * n + rows)
-    _, _, rank = jax.lax.fori_loop(0, n // 2, step, (start, jnp.zeros((), rows.dtype), rank))
+    first = jnp.zeros((), rows.dtype)
+    _, _, rank = jax.lax.fori_loop(0, max(n // 2, min(n, size)), step, (start, first, rank))
     return jnp.argsort(rank)
 
 

@@ -221,28 +221,6 @@ def test_properties_parser(archives: ModuleType) -> None:
 TWO_TRIANGLES = "v 0 0 0\nv 4 0 0\nv 0 1 0\nv 0 0 3\nf 1 2 3\nf 1 1 2\nf 1 3 4\n"
 
 
-def test_sampling_is_by_area_and_skips_degenerate_faces(builder: ModuleType) -> None:
-    vertices, triangles = builder.parse_obj(TWO_TRIANGLES)
-    rng = np.random.default_rng(0)
-    points, normals = builder.sample_surface(vertices, triangles, 7000, rng)
-    on_floor = points[:, 2] == 0
-    assert abs(on_floor.mean() - 2 / (2 + 1.5)) < 0.03
-    np.testing.assert_array_equal(normals[on_floor] == [0, 0, 1], True)
-    np.testing.assert_array_equal(normals[~on_floor] == [1, 0, 0], True)
-    np.testing.assert_allclose(points[on_floor].mean(0), [4 / 3, 1 / 3, 0], atol=0.05)
-    with pytest.raises(ValueError, match="all degenerate"):
-        builder.sample_surface(vertices, triangles[1:2], 10, rng)
-
-
-def test_farthest_points_equal_a_plain_loop(builder: ModuleType) -> None:
-    points = np.random.default_rng(1).normal(size=(60, 3))
-    chosen = [0]
-    while len(chosen) < 20:
-        gaps = [min(np.linalg.norm(p - points[c]) for c in chosen) for p in points]
-        chosen.append(int(np.argmax(gaps)))
-    assert builder.farthest_points(points, 20).tolist() == chosen
-
-
 def test_a_model_depends_on_its_key_and_rotation_alone(builder: ModuleType) -> None:
     points, normals = builder.sample_model(TWO_TRIANGLES, None, "a|b")
     assert (points.dtype, normals.dtype) == (np.int16, np.int8)

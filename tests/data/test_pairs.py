@@ -9,8 +9,17 @@ from scipy.spatial.transform import Rotation
 
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.frozen import CAD_VARIANTS, cad_test_pairs, freeze, thaw
-from dbdnet_jax.data.pairs import Protocol, draw_recipe, make_pair
+from dbdnet_jax.data.pairs import (
+    Protocol,
+    draw_recipe,
+    imperfect_overlap,
+    make_pair,
+    moved_pair,
+    starting_motion,
+)
 from dbdnet_jax.data.shapes import select
+from dbdnet_jax.ops import rigid
+from tests.conftest import FLOAT32, assert_close
 
 SMALL = Protocol(points=64)
 # What a published table says of its pairs; a changed file is another test set.
@@ -143,3 +152,40 @@ def test_the_packages_test_sets_are_the_published_ones(variant):
 def test_an_unknown_test_set_is_refused():
     with pytest.raises(ValueError, match="variant must be one of .*'noise'.*; got 'rain'"):
         cad_test_pairs("rain")
+
+
+def test_imperfect_overlap_is_now_true_now_everything_now_something_between(pairs):
+    pair = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), pairs)
+    keys = jax.random.split(jax.random.key(9), 300)
+    draw = jax.jit(jax.vmap(lambda key: imperfect_overlap(key, pair, 0.1)))
+    for masks, truth in zip(draw(keys), (pair.source_overlap, pair.target_overlap), strict=True):
+        masks, truth = np.asarray(masks), np.asarray(truth)
+        true, everything = (masks == truth).all(1), masks.all(1)
+        assert 0.12 < true.mean() < 0.28 and 0.12 < everything.mean() < 0.28
+        others = masks[~true & ~everything]
+        assert (others & ~truth).any() and (~others & truth).any()
+        assert 0.6 < (others == truth).mean() < 0.99
+
+
+def test_a_pass_starts_from_aligned_centroids_or_from_a_rough_pose(pairs):
+    pair = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), pairs)
+    keys = jax.random.split(jax.random.key(10), 300)
+    found = jax.jit(jax.vmap(lambda key: starting_motion(key, pair)))(keys)
+    rotation, translation = map(np.asarray, found)
+    blind = np.all(rotation == np.eye(3), axis=(1, 2))
+    assert 0.3 < blind.mean() < 0.5
+    centroids = [np.mean(cloud.points, axis=0) for cloud in (pair.source, pair.target)]
+    expected = np.broadcast_to(centroids[1] - centroids[0], translation[blind].shape)
+    assert_close(translation[blind], expected, FLOAT32)
+    left = Rotation.from_matrix(rotation[~blind] @ np.asarray(pair.target_from_source.rotation).T)
+    angles = np.degrees(left.magnitude())
+    assert angles.max() <= 40.01 and angles.min() < 3 and 15 < angles.mean() < 25
+
+
+def test_a_moved_pair_has_the_rest_of_the_motion_left(pairs):
+    pair = jax.tree.map(lambda leaf: jnp.asarray(leaf[1]), pairs)
+    motion = starting_motion(jax.random.key(3), pair)
+    moved = moved_pair(pair, motion)
+    aligned, again = (rigid.apply(p.target_from_source, p.source.points) for p in (pair, moved))
+    assert_close(again, aligned, FLOAT32)
+    assert not np.allclose(moved.source.points, pair.source.points, atol=0.1)

@@ -1,5 +1,7 @@
 """The whole network: padding, masks, row order and position must not matter to it."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,8 +11,9 @@ from dbdnet_jax.model.config import ModelConfig
 from dbdnet_jax.model.dbdnet import register, select
 from dbdnet_jax.model.params import parameter_shapes
 from dbdnet_jax.types import Branch, Registration
+from tests import oracle
 from tests.conftest import EXACT, assert_close, random_cloud
-from tests.model.small import NETWORK, cast, small_params
+from tests.model.small import NETWORK, SMALL, cast, small_params
 
 N, COUNT, M = 64, 52, 49
 SOURCE, TARGET = random_cloud(0, COUNT), random_cloud(1, M)
@@ -68,11 +71,22 @@ def assert_same_answer(found: Registration, expected: Registration):
         assert_close(a, b, NETWORK if a.dtype == np.float64 else EXACT)
 
 
-# In the first nearly all points pass the threshold, in the second too few, so the best are kept.
-@pytest.fixture(params=[5, 0], ids=["threshold", "fewest"])
+LIMITED = dataclasses.replace(
+    SMALL,
+    overlap_matching=True,
+    overlap_passes=2,
+    overlap_points=40,
+    registration_points=24,
+    iterations=2,
+)
+
+
+# In the first nearly all points pass the threshold, in the second too few, so the best are kept;
+# in the third the networks see fewer points than there are, match them, and both go twice.
+@pytest.fixture(params=[(5, SMALL), (0, SMALL), (5, LIMITED)], ids=["threshold", "fewest", "limit"])
 def params(request, x64):
     """Parameters of a small network."""
-    return small_params(request.param)
+    return small_params(*request.param)
 
 
 @pytest.fixture
@@ -103,6 +117,14 @@ def test_any_mask_will_do(params, answer):
     for branch in (found.rotation_branch, found.translation_branch):
         assert not np.any(branch.correspondence[others[0]])
         assert not np.any(branch.correspondence[:, others[1]])
+
+
+def test_a_limit_keeps_the_points_farthest_from_each_other(x64):
+    answer = register_spread(small_params(5, LIMITED), SOURCE, TARGET)
+    above = np.flatnonzero(answer.src_overlap > 0.5)
+    assert len(above) > 24
+    expected = above[oracle.farthest_samples(SOURCE[above] - SOURCE[above].mean(0), 24)]
+    assert_close(np.flatnonzero(answer.src_kept), np.sort(expected), EXACT)
 
 
 def test_permuting_the_points_permutes_the_answer(x64):

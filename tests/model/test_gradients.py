@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from dbdnet_jax.model.dbdnet import register
-from tests.conftest import assert_finite, random_cloud
-from tests.model.small import small_params
+from dbdnet_jax.model.registration import ParameterNetwork
+from dbdnet_jax.types import Cloud
+from tests.conftest import Tolerance, assert_close, assert_finite, random_cloud
+from tests.model.small import SMALL, small_params
 
 N, COUNT = 24, 20
 
@@ -31,6 +33,24 @@ answer_and_gradient = jax.jit(answer_and_gradient_eagerly)
 
 def all_rows():
     return jnp.ones(N, bool), jnp.ones(N, bool)
+
+
+def test_compilation_keeps_the_derivative_of_the_maximum_over_points(x64):
+    # Features are computed again for the derivative, where the compiler may round them otherwise.
+    variables = {"params": small_params(5).registration["weight_net"]}
+    counts = jnp.asarray([COUNT, N])
+
+    @jax.jit
+    @jax.value_and_grad
+    def total(points):
+        scale = ParameterNetwork(SMALL).apply(variables, Cloud(points, counts))
+        return sum(weight * x for weight, x in enumerate(scale, start=1))
+
+    points, direction = (random_cloud(seed, 2 * N).reshape(2, N, 3) for seed in (1, 2))
+    _, gradient = total(jnp.asarray(points))
+    ends = [total(jnp.asarray(points + step * direction))[0] for step in (1e-6, -1e-6)]
+    # A rectified unit or two switch within the step.
+    assert_close(jnp.sum(gradient * direction), (ends[0] - ends[1]) / 2e-6, Tolerance(1e-3, 0.0))
 
 
 @pytest.mark.parametrize("garbage", [0.0, 1e3, np.nan])

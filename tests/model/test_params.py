@@ -23,6 +23,7 @@ from dbdnet_jax.types import Cloud
 CONFIG = ModelConfig(
     overlap_channels=8,
     overlap_blocks=1,
+    overlap_matching=True,
     registration_channels=12,
     shared_blocks=3,
     rotation_blocks=2,
@@ -48,8 +49,8 @@ def test_fresh_parameters_are_distributed_as_torch_does():
     block = "overlap/attention_0/self_attention"
     glorot = (6 / (32 + 96)) ** 0.5
     for name, bound in (
-        ("overlap/decoder_0/conv/kernel", 64**-0.5),
-        ("overlap/decoder_0/conv/bias", 64**-0.5),
+        ("overlap/decoder_0/conv/kernel", 73**-0.5),
+        ("overlap/decoder_0/conv/bias", 73**-0.5),
         (f"{block}/in_proj/kernel", glorot),
         (f"{block}/out_proj/kernel", 32**-0.5),
     ):

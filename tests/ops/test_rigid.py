@@ -83,6 +83,14 @@ def test_euler_angles_are_scipys_extrinsic_xyz(precision):
         assert_close(oracle.rotation_from_euler(angles), scipys, FLOAT64)
 
 
+def test_a_rotation_about_an_axis_is_scipys(precision):
+    rotation_about = jax.jit(rigid.rotation_about)
+    for vector in random_cloud(0, 10):
+        angle = np.linalg.norm(vector)
+        found = rotation_about(*(jnp.asarray(x, precision.dtype) for x in (vector / angle, angle)))
+        assert_close(found, Rotation.from_rotvec(vector).as_matrix(), precision.tolerance)
+
+
 def test_random_motions_are_uniform_within_their_bounds():
     keys = jax.random.split(jax.random.key(0), 2000)
     drawn = jax.jit(jax.vmap(lambda key: rigid.random_rigid(key, 0.7, 2.0)))(keys)

@@ -1,0 +1,148 @@
+"""What can be known of a pose without the true one: residuals, information, free motions.
+
+Everything here is NumPy in float64, at the network's scale (shapes in the unit sphere), with the
+source already moved.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+Points = Float[np.ndarray, "n 3"]
+OtherPoints = Float[np.ndarray, "m 3"]
+Direction = Float[np.ndarray, "3"]
+
+NEAREST_INLIER = 0.03  # of the unit: noise and the last error of a pose, for dense clouds
+NORMAL_NEIGHBOURS = 16  # at least; of dense clouds a 250th part, to reach beyond their noise
+# A motion is free when it changes the distances between the surfaces by less than this part of
+# itself (root mean square); estimated normals of a noisy plane vary by about half of it.
+FREE = 0.1
+
+
+class Motion(NamedTuple):
+    """A motion that the surfaces do not resist: along ``direction``, or about it."""
+
+    kind: str  # "rotation" or "translation"
+    direction: Direction
+
+
+class Judgement(NamedTuple):
+    """Source points (n) against the surface of the target.
+
+    ``inlier[i]``: source point i has a target point within ``distance``. ``rmse`` is over these
+    pairs, ``plane_rmse`` over their distances along the target's normals. ``information`` (6, 6)
+    is that of the latter for a small rotation about ``pivot`` and a small translation, the
+    noise's variance taken from the residuals; ``stiffness`` its smallest part per point, scaled
+    to 0 (free) .. 1/3 (held the same from all sides).
+    """
+
+    inlier: Bool[np.ndarray, " n"]
+    distance: float
+    rmse: float
+    plane_rmse: float
+    information: Float[np.ndarray, "6 6"]
+    pivot: Direction
+    stiffness: float
+    free: tuple[Motion, ...]
+
+
+def inlier_distance(source: Points, target: OtherPoints) -> float:
+    """How far apart two points of one surface may stand: twice the wider spacing of the two."""
+    from scipy.spatial import cKDTree
+
+    spacings = [
+        np.median(cKDTree(points).query(points, k=2)[0][:, 1]) for points in (source, target)
+    ]
+    return float(max(NEAREST_INLIER, 2 * max(spacings)))
+
+
+def near(points: Points, others: OtherPoints, distance: float) -> Bool[np.ndarray, " n"]:
+    """Which points have another cloud's point within ``distance``."""
+    from scipy.spatial import cKDTree
+
+    return np.isfinite(cKDTree(others).query(points, distance_upper_bound=distance)[0])
+
+
+def judge(moved: Points, target: OtherPoints, distance: float) -> Judgement:
+    """Compare a moved source with a target; fewer than six inliers leave every motion free."""
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(target)
+    found, rows = tree.query(moved, distance_upper_bound=distance)
+    inlier = np.isfinite(found)
+    if inlier.sum() < 6:
+        axes = [Motion(kind, axis) for kind in ("rotation", "translation") for axis in np.eye(3)]
+        nothing = np.zeros((6, 6)), moved.mean(axis=0), 0.0, tuple(axes)
+        return Judgement(inlier, distance, np.inf, np.inf, *nothing)
+    points, rows = moved[inlier], rows[inlier]
+    normals = surface_normals(target, tree, rows)
+    residual = ((points - target[rows]) * normals).sum(axis=1)
+    plane_rmse = float(np.sqrt(np.mean(residual**2)))
+    pivot = points.mean(axis=0)
+    arm = points - pivot
+    jacobian = np.hstack([np.cross(arm, normals), normals])
+    held = jacobian.T @ jacobian
+    length = max(float(np.sqrt((arm**2).sum(axis=1).mean())), 1e-12)
+    unit = np.repeat([1 / length, 1.0], 3)
+    stiffness, free = _free_motions(held * unit * unit[:, None] / len(points))
+    return Judgement(
+        inlier,
+        distance,
+        float(np.sqrt(np.mean(found[inlier] ** 2))),
+        plane_rmse,
+        held / max(plane_rmse, 1e-6) ** 2,
+        pivot,
+        stiffness,
+        free,
+    )
+
+
+def surface_normals(
+    target: OtherPoints, tree: Any, rows: Int[np.ndarray, " k"]
+) -> Float[np.ndarray, "k 3"]:
+    """Unit normals at the given rows: the flattest direction of the nearest neighbours."""
+    _, near = tree.query(
+        target[rows], k=max(min(NORMAL_NEIGHBOURS, len(target)), len(target) // 250)
+    )
+    offsets = target[near] - target[near].mean(axis=1, keepdims=True)
+    return np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))[1][:, :, 0]
+
+
+def _free_motions(held: Float[np.ndarray, "6 6"]) -> tuple[float, tuple[Motion, ...]]:
+    """The smallest eigenvalue of ``held``, and the motions whose eigenvalue is below FREE^2.
+
+    Translations first; rotations are then judged with the best translation beside each, so that
+    a rotation about an axis elsewhere is found too.
+    """
+    values, axes = np.linalg.eigh(held[3:, 3:])
+    slack = values < FREE**2
+    motions = [Motion("translation", axis) for axis in axes.T[slack]]
+    stiff = axes[:, ~slack]
+    coupling = held[:3, 3:] @ stiff
+    about = held[:3, :3] - coupling @ np.diag(1 / values[~slack]) @ coupling.T
+    turning, turns = np.linalg.eigh(about)
+    motions += [Motion("rotation", axis) for axis in turns.T[turning < FREE**2]]
+    return float(np.linalg.eigvalsh(held)[0]), tuple(motions)
+
+
+def in_words(motions: tuple[Motion, ...]) -> str:
+    """For people: ``rotation about [0 0 1] and translation along [1 0 0]``."""
+    phrases = []
+    for kind, preposition in (("translation", "along"), ("rotation", "about")):
+        axes = [motion.direction for motion in motions if motion.kind == kind]
+        if len(axes) == 3:
+            phrases.append(f"{kind} {preposition} every axis")
+        elif len(axes) == 2:
+            phrases.append(
+                f"{kind} {preposition} every axis normal to {written(np.cross(axes[0], axes[1]))}"
+            )
+        elif axes:
+            phrases.append(f"{kind} {preposition} {written(axes[0])}")
+    return " and ".join(phrases)
+
+
+def written(axis: Direction) -> str:
+    """An axis by its upper end: ``[0 0.5 0.87]``."""
+    upright = np.round(axis * np.sign(axis[np.abs(axis).argmax()]), 2) + 0.0  # no -0
+    return f"[{' '.join(f'{x:.2g}' for x in upright)}]"

@@ -1,0 +1,84 @@
+"""A pair at the network's scale, and the way back to the clouds as given."""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from dbdnet_jax.reading import MIN_POINTS
+from dbdnet_jax.search import Transform, as_transform, move
+from dbdnet_jax.thinning import UNIT_SIZE, Thinned, thin
+
+Points = Float[np.ndarray, "n 3"]
+OtherPoints = Float[np.ndarray, "m 3"]
+
+
+class Side(NamedTuple):
+    """One cloud as given, the rows chosen of it, and these at the network's scale."""
+
+    points: Points
+    thinned: Thinned
+    dense: Float[np.ndarray, "d 3"]
+    sparse: Float[np.ndarray, "s 3"]
+
+
+class Scene(NamedTuple):
+    """Both clouds, each about its own centre, the source turned by the guess, one scale.
+
+    ``factor`` leads from the given unit to the network's.
+    """
+
+    source: Side
+    target: Side
+    factor: float
+    guess: Transform
+
+
+def build_scene(
+    source: Points, target: OtherPoints, scale: float | str, max_points: int, guess: Transform
+) -> Scene:
+    """Thin, centre, turn and scale two clouds, in float64.
+
+    Raises:
+      ValueError: a cloud whose points are at too few places.
+    """
+    thinned = thin(source, max_points), thin(target, max_points)
+    for name, rows in zip(("source", "target"), thinned, strict=True):
+        if len(rows.sparse) < MIN_POINTS:
+            raise ValueError(
+                f"{name} must have points at {MIN_POINTS} places at least; got "
+                f"{len(rows.sparse)}. Give more points."
+            )
+    factor = UNIT_SIZE / max(rows.size for rows in thinned) if scale == "auto" else float(scale)
+
+    def side(points, rows, turn):
+        dense, sparse = (
+            (points[x] - rows.centre) @ turn.T * factor for x in (rows.dense, rows.sparse)
+        )
+        return Side(points, rows, dense, sparse)
+
+    return Scene(
+        side(source, thinned[0], guess[:3, :3]), side(target, thinned[1], np.eye(3)), factor, guess
+    )
+
+
+def guess_in_scene(scene: Scene) -> Transform:
+    """The guess where the source has been turned by it already: a translation."""
+    start = np.eye(4)
+    moved = move(scene.guess, scene.source.thinned.centre)
+    start[:3, 3] = (moved - scene.target.thinned.centre) * scene.factor
+    return start
+
+
+def as_given(pose: Transform, scene: Scene) -> Transform:
+    """A pose of the scene as one of the clouds as given."""
+    transform = as_transform(pose[:3, :3] @ scene.guess[:3, :3], np.zeros(3))
+    moved = transform[:3, :3] @ scene.source.thinned.centre
+    transform[:3, 3] = pose[:3, 3] / scene.factor + scene.target.thinned.centre - moved
+    return transform
+
+
+def size_ratio(scene: Scene) -> float:
+    """The larger cloud's size per the smaller one's."""
+    sizes = scene.source.thinned.size, scene.target.thinned.size
+    return max(sizes) / min(sizes)

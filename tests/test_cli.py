@@ -1,0 +1,172 @@
+"""`dbdnet-register`: what it prints and writes, its exit status, and that it writes whole files."""
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dbdnet_jax import save_params
+from dbdnet_jax.cli import ALIGNED, UNSURE, UNUSABLE, main
+from dbdnet_jax.reading import read_points, read_transform
+from dbdnet_jax.writing import write_ply
+from tests.aligning import POINTS, pair, rotation_error_deg, tiny_align, tiny_params
+
+ALIGN = importlib.import_module("dbdnet_jax.align")  # the package's name may be the function's
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """Weights, a guess, and two clouds that it fits."""
+    folder = tmp_path_factory.mktemp("cli")
+    source, target, transform = pair()
+    write_ply(folder / "a.ply", source)
+    write_ply(folder / "b.ply", target)
+    np.savetxt(folder / "guess.txt", transform)
+    save_params(folder / "tiny.npz", tiny_params())
+    return folder
+
+
+@pytest.fixture
+def run(folder, capsys, monkeypatch):
+    """Run the command in the folder; returns status, stdout and stderr."""
+    monkeypatch.chdir(folder)
+
+    def run(*arguments, batch=False):
+        fixed = ["--params", "tiny.npz", "--max-points", str(POINTS)]
+        fixed += [] if batch else ["--initial", "guess.txt"]
+        status = main([*map(str, arguments), *fixed])
+        return status, *capsys.readouterr()
+
+    return run
+
+
+def likely(monkeypatch, probability: float) -> None:
+    """Let the success probability be what a test needs; the tiny network is untrained."""
+    monkeypatch.setattr(ALIGN, "success_probability", lambda *_: probability)
+
+
+def test_the_summary_goes_to_stdout_and_progress_to_stderr(run, monkeypatch):
+    likely(monkeypatch, 0.9)
+    status, out, err = run("a.ply", "b.ply")
+    assert status == ALIGNED
+    assert err == "a.ply -> b.ply ...\n"
+    rows = np.array([line.split() for line in out.splitlines()[1:5]], float)
+    assert rotation_error_deg(rows, pair()[2]) < 2
+    assert out.splitlines()[-1] == "aligned"
+    assert "probability  0.900" in out
+
+
+def test_an_unlikely_pose_is_status_1_with_its_reason(run, monkeypatch):
+    likely(monkeypatch, 0.2)
+    status, out, _ = run("a.ply", "b.ply")
+    assert status == UNSURE
+    assert out.splitlines()[-1].startswith("NOT ALIGNED with confidence: the pose is right with")
+
+
+@pytest.mark.parametrize("ending", ["txt", "json", "npy"])
+def test_the_transform_is_written_to_the_last_digit(run, folder, tmp_path, ending):
+    run("a.ply", "b.ply", "-o", tmp_path / f"t.{ending}")
+    clouds = [read_points(folder / name) for name in ("a.ply", "b.ply")]
+    expected = tiny_align(*clouds, initial=read_transform(folder / "guess.txt"))
+    np.testing.assert_array_equal(read_transform(tmp_path / f"t.{ending}"), expected.transform)
+    assert [path.name for path in tmp_path.iterdir()] == [f"t.{ending}"]
+
+
+def test_json_on_stdout_is_one_object_with_the_numbers(run):
+    _, out, _ = run("a.ply", "b.ply", "--json")
+    held = json.loads(out)
+    assert out.count("\n") == 1
+    assert held["source"] == "a.ply" and isinstance(held["valid"], bool)
+    assert np.shape(held["transform"]) == (4, 4) and np.shape(held["information"]) == (6, 6)
+
+
+def test_the_moved_source_is_saved(run, tmp_path):
+    run("a.ply", "b.ply", "--save-aligned", tmp_path / "m.ply", "-o", tmp_path / "t.npy")
+    transform = np.load(tmp_path / "t.npy")
+    moved = read_points("a.ply") @ transform[:3, :3].T + transform[:3, 3]
+    np.testing.assert_allclose(read_points(tmp_path / "m.ply"), moved, atol=1e-12)
+
+
+def test_no_refinement_is_asked_for(run, monkeypatch):
+    monkeypatch.setattr("dbdnet_jax.search.best_rival", lambda *_: pytest.fail("judged"))
+    refined = []
+    monkeypatch.setattr("dbdnet_jax.search.refine", lambda pose, *_: refined.append(1) or pose)
+    with pytest.raises(pytest.fail.Exception, match="judged"):
+        run("a.ply", "b.ply", "--no-refine")
+    assert not refined
+
+
+def test_a_list_of_pairs_writes_a_transform_each_and_goes_on_after_a_bad_one(run, tmp_path):
+    (tmp_path / "pairs.txt").write_text(
+        f"# source target\n{Path.cwd()}/a.ply {Path.cwd()}/b.ply\n\nmissing.ply 'b b.ply'\n"
+    )
+    status, out, err = run("--batch", tmp_path / "pairs.txt", "-o", tmp_path, "--json", batch=True)
+    assert status == UNUSABLE
+    assert "error: a point file must exist" in err and out.count("\n") == 1
+    assert {path.name for path in tmp_path.iterdir()} == {"pairs.txt", "0002_a_b.txt"}
+
+
+def test_a_folder_of_pairs_goes_by_names(run, folder, tmp_path):
+    for name in ("one", "two"):
+        os.link(folder / "a.ply", tmp_path / f"{name}_source.ply")
+        os.link(folder / "b.ply", tmp_path / f"{name}_target.ply")
+    (tmp_path / "out").mkdir()
+    status, out, _ = run("--batch", tmp_path, "-o", tmp_path / "out", batch=True)
+    assert status in (ALIGNED, UNSURE)
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["one.txt", "two.txt"]
+
+
+@pytest.mark.parametrize(("where", "moment"), [(ALIGN, "align"), (os, "fsync")])
+def test_an_interrupt_leaves_no_file(run, tmp_path, monkeypatch, where, moment):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(where, moment, interrupt)
+    status, _, err = run("a.ply", "b.ply", "-o", tmp_path / "t.txt")
+    assert status == 130 and "no file was left half-written" in err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_full_disk_leaves_no_file(run, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    status, _, err = run("a.ply", "b.ply", "-o", tmp_path / "t.txt")
+    assert status == UNUSABLE and "No space left" in err
+    assert not list(tmp_path.iterdir())
+
+
+def test_help_has_examples_and_the_exit_status_and_imports_nothing_heavy():
+    code = (
+        "import sys\nfrom dbdnet_jax import cli\n"
+        "try: cli.main(['--help'])\n"
+        "finally: print(sorted({'scipy', 'trimesh', 'open3d'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert "examples:\n  dbdnet-register scan_a.ply scan_b.ply" in done.stdout
+    assert "exit status: 0 aligned, 1 not aligned" in done.stdout
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_python_m_is_the_same_command(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "dbdnet_jax", "a.ply"], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == UNUSABLE
+    assert "give two clouds" in done.stderr and "Traceback" not in done.stderr
+
+
+def test_the_examples_are_scans_of_one_shape():
+    source, target = (read_points(EXAMPLES / f"scan_{x}.ply") for x in "ab")
+    true = read_transform(EXAMPLES / "b_from_a.txt")
+    assert len(source) == len(target) == 717
+    found = tiny_align(source, target, initial=true)
+    assert rotation_error_deg(found.transform, true) < 3
+    assert found.inlier_ratio > 0.5
