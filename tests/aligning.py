@@ -44,7 +44,7 @@ def motion(seed: int, degrees: float = 8.0, shift: float = 0.5) -> np.ndarray:
     return transform
 
 
-def pair(count: int = 400, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def pair(count: int = 380, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Source, target and the true transform between them; no point stands in both."""
     transform = motion(seed)
     rotation, translation = transform[:3, :3], transform[:3, 3]
