@@ -19,6 +19,6 @@ def get_config() -> ConfigDict:
     config.train.log_every = 50
     config.train.validate_every = 500
     config.train.checkpoint_every = 500
-    config.overlap.epochs = 3.0
-    config.registration.epochs = 5.0
+    config.overlap.epochs = 2.0
+    config.registration.epochs = 4.0
     return config
