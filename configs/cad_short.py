@@ -2,8 +2,10 @@
 
     python train.py --config=configs/cad_short.py
 
-About 20 minutes of CPU time with compilation and the table. The overlap network has not learned
-more than "all points overlap" by then, and the table says so.
+Seven minutes on two cores, compilation and the table included. Expected on the noisy test pairs:
+Error R 24.0 degrees, Error t 0.398 (untrained 39.6 and 0.622); polished 14.1 and 0.261. The overlap
+network has hardly learned more than "all points overlap" by then (accuracy 0.784, F1 0.871), and
+the table says so.
 """
 
 from ml_collections import ConfigDict
