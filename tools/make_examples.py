@@ -17,7 +17,7 @@ from dbdnet_jax.files import write_whole
 from dbdnet_jax.writing import write_ply
 
 FOLDER = Path(__file__).parents[1] / "examples"
-SHAPE = "biplane"
+SHAPE = "corner sofa"
 RADIUS_M = 0.75
 FRAME_M = np.array([12.0, -3.5, 0.8])  # where the target's frame puts the shape
 
