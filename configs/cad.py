@@ -3,8 +3,8 @@
     python train.py --config=configs/cad.py
 
 50 + 50 epochs of 642 shapes, 32,100 pairs for each network at about 80 ms of one core: an hour on
-two cores. The weights in the package come of shorter runs, one after the other, and docs/training.md
-has their commands and curves; from fresh weights this schedule has not been run to its end.
+two cores. The weights in the package come of shorter runs, one after the other; docs/training.md
+has their commands and curves. From fresh weights this schedule has not been run to its end.
 """
 
 from ml_collections import ConfigDict
