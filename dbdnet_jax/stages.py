@@ -74,6 +74,11 @@ def _first_params(settings: Settings) -> Params:
     fresh = init_params(jax.random.key(settings.train.seed), settings.model)
     if not settings.train.start:
         return fresh
+    if not Path(settings.train.start).is_file():
+        raise FileNotFoundError(
+            "config.train.start must be a file of weights; there is none at "
+            f"{settings.train.start}. Give its path, or '' to start from fresh weights."
+        )
     start = load_params(settings.train.start)
     merged = Params(
         start.overlap or fresh.overlap, start.registration or fresh.registration, settings.model

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import io
 import json
-import os
-import uuid
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from dbdnet_jax.files import write_whole
 from dbdnet_jax.model.config import ModelConfig
 from dbdnet_jax.model.dbdnet import Params
 from dbdnet_jax.model.params import flatten, parameter_shapes, require_shapes, unflatten
@@ -65,17 +65,10 @@ def save_params(
         raise FileNotFoundError(
             f"The folder of a file of weights must exist; {path.parent} does not. Create it."
         )
-    # In the same folder, since only a rename within a file system is atomic.
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
     members: dict[str, Any] = {_HEADER: header, _CHECKSUM: _checksum(header, arrays), **arrays}
-    try:
-        with open(temporary, "xb") as file:
-            np.savez(file, **members)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    buffer = io.BytesIO()
+    np.savez(buffer, **members)
+    write_whole(path, buffer.getbuffer())
 
 
 def load_params(path: str | Path) -> Params:

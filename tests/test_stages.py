@@ -120,6 +120,12 @@ def test_networks_of_several_passes_go_on_from_weights(run_dir, tmp_path, stage)
     assert np.mean(moved) > 0.9
 
 
+def test_a_start_must_be_there(tmp_path):
+    train = dataclasses.replace(SETTINGS.train, start=str(tmp_path / "gone.npz"))
+    with pytest.raises(FileNotFoundError, match="there is none at .*gone.npz. Give its path, or"):
+        fit(dataclasses.replace(SETTINGS, train=train), "overlap", tmp_path, source())
+
+
 def test_weights_of_another_width_are_no_start(run_dir, tmp_path):
     weights = tmp_path / "weights.npz"
     save_params(weights, load_best(run_dir))

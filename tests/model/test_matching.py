@@ -76,3 +76,19 @@ def test_matches_are_told_in_the_callers_frames_whatever_the_padding(x64):
     for cloud, (size, points) in enumerate(zip((30, 27), matched.clouds.points, strict=True)):
         expected = np.asarray(points[:size]) + shift[cloud]
         assert_close(moved[2].clouds.points[cloud, :size], expected, NETWORK)
+
+
+def test_a_second_pass_goes_on_from_the_motion_of_the_first(x64):
+    one = dataclasses.replace(SMALL, overlap_matching=True)
+    two = dataclasses.replace(one, overlap_passes=2)
+    clouds = padded(random_cloud(4, 30) + 1.0, 40, 0.0), padded(random_cloud(5, 27) - 2.0, 40, 0.0)
+    predict = jax.jit(predict_overlap_and_matches)
+    params = small_params(3, one).replace(registration=None)
+    first = predict(params, *clouds)[2].motion
+    *probabilities, matched = predict(params, *clouds, start=first)
+    *both, after = predict(params.replace(config=two), *clouds)
+    for found, expected in zip(both, probabilities, strict=True):
+        assert_close(found, expected, NETWORK)
+    assert_close(after.motion.rotation, matched.motion.rotation, NETWORK)
+    assert_close(after.motion.translation, matched.motion.translation, NETWORK)
+    assert np.linalg.norm(after.motion.rotation - first.rotation) > 0.01
