@@ -8,14 +8,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from dbdnet_jax import search
-from dbdnet_jax.judging import inlier_distance, judge
+from dbdnet_jax.alignment import search
+from dbdnet_jax.alignment.judging import inlier_distance, judge
+from dbdnet_jax.alignment.reading import read_points
+from dbdnet_jax.alignment.scene import Scene, Side, as_given, build_scene, guess_in_scene
+from dbdnet_jax.alignment.search import Proposal, Transform
+from dbdnet_jax.alignment.success import Evidence, gather, load_coefficients, success_probability
+from dbdnet_jax.alignment.verdict import doubt, warnings
 from dbdnet_jax.model.params import Params
-from dbdnet_jax.reading import read_points
-from dbdnet_jax.scene import Scene, Side, as_given, build_scene, guess_in_scene
-from dbdnet_jax.search import Proposal, Transform
-from dbdnet_jax.success import Evidence, gather, load_coefficients, success_probability
-from dbdnet_jax.verdict import doubt, warnings
 from dbdnet_jax.weights import load_pretrained
 
 MAX_POINTS = 768  # the weights were trained on 717; a little more costs nothing

@@ -94,8 +94,8 @@ def _scale(text: str) -> float | str:
 
 def _settings(options: argparse.Namespace) -> dict:
     """Arguments of `align` that all pairs share; imports what takes time to import."""
+    from dbdnet_jax.alignment.reading import read_transform
     from dbdnet_jax.programs import keep_compiled_programs
-    from dbdnet_jax.reading import read_transform
     from dbdnet_jax.weights import load_params, load_pretrained
 
     keep_compiled_programs()
@@ -159,7 +159,7 @@ def _run(job: Job, options: argparse.Namespace, settings: dict) -> int:
     import json
 
     from dbdnet_jax.align import align
-    from dbdnet_jax.reading import read_points
+    from dbdnet_jax.alignment.reading import read_points
     from dbdnet_jax.writing import as_json, write_ply, write_transform
 
     print(f"{job.source} -> {job.target} ...", file=sys.stderr)

@@ -29,9 +29,8 @@ from dbdnet_jax.metrics import (
     summarise,
     summarise_overlap,
 )
-from dbdnet_jax.model.dbdnet import register, register_given_overlap
+from dbdnet_jax.model.dbdnet import register_clouds, register_given_overlap
 from dbdnet_jax.model.params import Params, init_params
-from dbdnet_jax.ops.sampling import prefix_mask
 from dbdnet_jax.pair_sets import load_test_pairs
 from dbdnet_jax.polish import polish
 from dbdnet_jax.recall import ScanRecall, Scans, correspondence_rmse_m, scan_recall
@@ -232,9 +231,7 @@ def _pair(pairs: Pair, i: int) -> Pair:
 
 
 def _register(params: Params, pair: Pair) -> Registration:
-    source, target = pair.source, pair.target
-    masks = (prefix_mask(len(cloud.points), cloud.count) for cloud in (source, target))
-    return register(params, source.points, target.points, *masks)
+    return register_clouds(params, pair.source, pair.target)
 
 
 def _register_and_polish(params: Params, pair: Pair) -> Rigid:

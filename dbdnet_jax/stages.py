@@ -21,8 +21,8 @@ from dbdnet_jax.losses import overlap_loss, registration_loss
 from dbdnet_jax.metrics import pair_confusion, registration_errors
 from dbdnet_jax.model.config import ModelConfig
 from dbdnet_jax.model.dbdnet import (
-    predict_overlap,
     predict_overlap_and_matches,
+    register_clouds,
     register_given_overlap,
 )
 from dbdnet_jax.model.params import (
@@ -138,32 +138,39 @@ def _overlap_functions(settings: Settings) -> tuple[LossFunction, Validation]:
 def _registration_functions(settings: Settings) -> tuple[LossFunction, Validation]:
     model, stage = settings.model, settings.registration
 
-    def answer(trainable, pair, masks, model=model, key=None):
+    # Each pass and each iteration is trained for itself, from starts as those before it may leave.
+    from_anywhere = (model.overlap_passes > 1 or model.iterations > 1) and not model.released
+
+    def given(key, frozen, pair, start):
+        if stage.masks == "predicted":
+            params = Params(frozen, None, model)
+            return predict_overlap_and_matches(params, pair.source, pair.target, start=start)[:2]
+        if stage.masks == "imperfect":
+            return imperfect_overlap(key, pair, settings.protocol.overlap_radius)
+        return pair.source_overlap, pair.target_overlap
+
+    def answer(trainable, pair, masks, key=None, model=model):
         params = Params(None, trainable, model)
         masks = [mask * 1.0 for mask in masks]
         return register_given_overlap(params, pair.source, pair.target, *masks, key)
 
-    def given(frozen, pair):
-        if stage.masks == "predicted":
-            return predict_overlap(Params(frozen, None, model), pair.source, pair.target)
-        return pair.source_overlap, pair.target_overlap
-
     def loss(trainable, frozen, pair, key):
         mask_key, start_key, dropout_key = jax.random.split(key, 3)
-        masks = given(frozen, pair)
-        if stage.masks == "imperfect":
-            masks = imperfect_overlap(mask_key, pair, settings.protocol.overlap_radius)
+        start = starting_motion(start_key, pair) if from_anywhere else None
+        masks = given(mask_key, frozen, pair, start)
         one = model
-        if model.iterations > 1 and not model.released:
-            # Each iteration is trained for itself, from starts as those before it may leave.
-            pair = moved_pair(pair, starting_motion(start_key, pair))
+        if start is not None:
+            pair = moved_pair(pair, start)
             one = dataclasses.replace(model, iterations=1)
         dropout_key = dropout_key if model.dropout else None
-        found = answer(trainable, pair, masks, one, dropout_key)
+        found = answer(trainable, pair, masks, dropout_key, one)
         return registration_loss(found, pair, stage.weights)
 
     def validate(trainable, frozen, pair):
-        found = answer(trainable, pair, given(frozen, pair))
+        if stage.masks == "predicted":
+            found = register_clouds(Params(frozen, trainable, model), pair.source, pair.target)
+        else:
+            found = answer(trainable, pair, (pair.source_overlap, pair.target_overlap))
         errors = registration_errors(found, pair)
         return {
             "error": errors.rotation_deg,

@@ -10,16 +10,16 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from dbdnet_jax.align import Alignment
-from dbdnet_jax.judging import Motion, in_words, inlier_distance, judge
-from dbdnet_jax.scene import build_scene
-from dbdnet_jax.success import (
+from dbdnet_jax.alignment.judging import Motion, in_words, inlier_distance, judge
+from dbdnet_jax.alignment.scene import build_scene
+from dbdnet_jax.alignment.success import (
     Coefficients,
     Evidence,
     load_coefficients,
     success_probability,
 )
-from dbdnet_jax.thinning import DENSE, UNIT_SIZE, farthest_rows, thin
-from dbdnet_jax.verdict import LIKELY
+from dbdnet_jax.alignment.thinning import DENSE, UNIT_SIZE, farthest_rows, thin
+from dbdnet_jax.alignment.verdict import LIKELY
 from tests.aligning import motion, pair, rotation_error_deg, solid, tiny_align
 from tests.conftest import random_cloud
 
@@ -145,7 +145,7 @@ def test_the_threshold_becomes_the_networks(monkeypatch):
         seen.append(params.config.overlap_threshold)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("dbdnet_jax.search.ask_network", ask)
+    monkeypatch.setattr("dbdnet_jax.alignment.search.ask_network", ask)
     with pytest.raises(KeyboardInterrupt):
         tiny_align(SOURCE, TARGET, overlap_threshold=0.25)
     assert seen == [0.25]

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from dbdnet_jax import save_params
+from dbdnet_jax.alignment.reading import read_points, read_transform
 from dbdnet_jax.cli import ALIGNED, UNSURE, UNUSABLE, main
-from dbdnet_jax.reading import read_points, read_transform
 from dbdnet_jax.writing import write_ply
 from tests.aligning import POINTS, pair, rotation_error_deg, tiny_align, tiny_params
 
@@ -94,9 +94,11 @@ def test_the_moved_source_is_saved(run, tmp_path):
 
 
 def test_no_refinement_is_asked_for(run, monkeypatch):
-    monkeypatch.setattr("dbdnet_jax.search.best_rival", lambda *_: pytest.fail("judged"))
+    monkeypatch.setattr("dbdnet_jax.alignment.search.best_rival", lambda *_: pytest.fail("judged"))
     refined = []
-    monkeypatch.setattr("dbdnet_jax.search.refine", lambda pose, *_: refined.append(1) or pose)
+    monkeypatch.setattr(
+        "dbdnet_jax.alignment.search.refine", lambda pose, *_: refined.append(1) or pose
+    )
     with pytest.raises(pytest.fail.Exception, match="judged"):
         run("a.ply", "b.ply", "--no-refine")
     assert not refined

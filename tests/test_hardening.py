@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from dbdnet_jax import save_params
+from dbdnet_jax.alignment.search import ask_network
 from dbdnet_jax.cli import UNUSABLE, main
-from dbdnet_jax.search import ask_network
 from dbdnet_jax.writing import write_ply
 from tests.aligning import POINTS, pair, rotation_error_deg, solid, tiny_align, tiny_params
 from tests.conftest import random_cloud

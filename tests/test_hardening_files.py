@@ -16,8 +16,8 @@ from ml_collections import ConfigDict
 
 from configs import cad
 from dbdnet_jax import from_released, load_params, load_pretrained, save_params
+from dbdnet_jax.alignment.reading import read_points, read_transform
 from dbdnet_jax.model.config import ModelConfig
-from dbdnet_jax.reading import read_points, read_transform
 from dbdnet_jax.safe_pickle import CheckpointError
 from dbdnet_jax.settings import read_settings
 from dbdnet_jax.writing import write_ply

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from dbdnet_jax.alignment.reading import MESH_SAMPLES, read_points, read_transform
 from dbdnet_jax.files import write_whole
-from dbdnet_jax.reading import MESH_SAMPLES, read_points, read_transform
 from tests.conftest import random_cloud
 
 POINTS = random_cloud(1, 40)

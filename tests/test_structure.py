@@ -16,7 +16,7 @@ types files
 ops.rigid ops.sampling ops.grouping ops.normals ops.attention ops.sinkhorn ops.pyramid
 safe_pickle torch_pickle
 model.config model.blocks model.edgeconv model.encoder model.matching model.params model.overlap
-model.registration model.stack model.dbdnet
+model.registration model.stack model.look model.dbdnet
 losses metrics recall
 data.shapes data.surface data.solids data.household data.furniture data.parts data.procedural
 data.overlap data.pairs data.cad data.modelnet40 data.threedmatch data.frozen
@@ -24,7 +24,9 @@ released weights checkpoint
 baselines.classical
 programs settings sources pair_sets parallel runlog stages training
 polish evaluation report
-reading thinning judging search scene success verdict align writing cli
+alignment.reading alignment.thinning alignment.judging alignment.search alignment.scene
+alignment.success alignment.verdict
+align writing cli
 __main__
 """.split()
 SCRIPTS = ("train", "evaluate")  # may import the package, not each other

@@ -18,13 +18,13 @@ from scipy.optimize import minimize
 from tqdm import tqdm
 
 from dbdnet_jax.align import align
+from dbdnet_jax.alignment.success import SUCCESS_DEG, SUCCESS_FILE, Evidence, load_coefficients
+from dbdnet_jax.alignment.success import success_probability as probability_of
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.frozen import cad_test_pairs
 from dbdnet_jax.data.pairs import Protocol, make_pair
 from dbdnet_jax.files import write_whole
 from dbdnet_jax.model.params import Params
-from dbdnet_jax.success import SUCCESS_DEG, SUCCESS_FILE, Evidence, load_coefficients
-from dbdnet_jax.success import success_probability as probability_of
 from dbdnet_jax.types import Pair
 from dbdnet_jax.weights import load_params, load_pretrained
 

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from dbdnet_jax.model.config import ModelConfig
+from dbdnet_jax.model.look import look, probability_of_all, view_of
 from dbdnet_jax.model.matching import Matched, soft_targets
-from dbdnet_jax.model.overlap import OverlapNetwork
 from dbdnet_jax.model.params import Params
 from dbdnet_jax.model.registration import RegistrationNetwork
 from dbdnet_jax.model.stack import (
@@ -20,7 +20,6 @@ from dbdnet_jax.model.stack import (
     uncentred,
 )
 from dbdnet_jax.ops import rigid
-from dbdnet_jax.ops.grouping import interpolate, interpolation_weights
 from dbdnet_jax.ops.rigid import HIGHEST
 from dbdnet_jax.ops.sampling import inverse_order, prefix_mask, prefix_order
 from dbdnet_jax.types import Branch, Cloud, Registration, Rigid
@@ -37,9 +36,11 @@ def register(
 
     Masks say which rows are points (all, if None); what stands in the other rows never matters.
     Pure, so `jax.jit`, `jax.vmap` and `jax.grad` with respect to the clouds apply (the derivative
-    takes neighbours, sampling, selection and interpolation weights as given). Coordinates are
-    expected at the scale the weights were trained at (the unit sphere for the CAD and ModelNet40
-    weights). Where nothing can be estimated ``valid`` is False and the motion the identity.
+    takes neighbours, sampling, selection and interpolation weights as given). With several
+    `ModelConfig.overlap_passes` both networks take turns, each time on the clouds as aligned so
+    far. Coordinates are expected at the scale the weights were trained at (the unit sphere for the
+    CAD and ModelNet40 weights). Where nothing can be estimated ``valid`` is False and the motion
+    the identity.
     """
     if params.registration is None:
         raise ValueError(
@@ -47,8 +48,42 @@ def register(
             "Use predict_overlap, or load a full checkpoint."
         )
     clouds, order = stack_masked(src, tgt, src_mask, tgt_mask)
-    probability, _ = _overlap(params, clouds)
-    return _register(params, clouds, order, probability, (src.shape[0], tgt.shape[0]))
+    sizes = src.shape[0], tgt.shape[0]
+    view = view_of(params.config, clouds)
+    start = rigid.identity(clouds.points.dtype)
+    if params.config.overlap_passes == 1:
+        logits, _ = look(params, view, start)
+        return _register(params, clouds, order, probability_of_all(view, logits), sizes)
+
+    level = clouds._replace(points=clouds.points - view.centroid[:, None, :])
+
+    def look_and_register(motion, _):
+        logits, _ = look(params, view, motion)
+        moved = move_source(level, motion)
+        answer = _register(params, moved, order, probability_of_all(view, logits), sizes)
+        motion = rigid.compose(Rigid(answer.rotation, answer.translation), motion)
+        return motion, (motion, answer)
+
+    _, answers = jax.lax.scan(look_and_register, start, length=params.config.overlap_passes)
+    motion, answer = jax.tree.map(lambda leaf: leaf[-1], answers)
+    motion = _identity_unless(answer.valid, uncentred(motion, view.centroid))
+    branches = (
+        branch._replace(target=branch.target + view.centroid[None, 1])
+        for branch in (answer.rotation_branch, answer.translation_branch)
+    )
+    rotation_branch, translation_branch = branches
+    return answer._replace(
+        rotation=motion.rotation,
+        translation=motion.translation,
+        rotation_branch=rotation_branch,
+        translation_branch=translation_branch,
+    )
+
+
+def register_clouds(params: Params, source: Cloud, target: Cloud) -> Registration:
+    """`register` of two clouds whose points are their first rows."""
+    masks = (prefix_mask(len(cloud.points), cloud.count) for cloud in (source, target))
+    return register(params, source.points, target.points, *masks)
 
 
 def predict_overlap(
@@ -73,11 +108,23 @@ def predict_overlap_and_matches(
 ) -> tuple[Float[Array, " n"], Float[Array, " m"], Matched | None]:
     """`predict_overlap`, and the soft matches of a network that has them (else None).
 
-    With a ``start``, a first idea of the motion, one pass from there instead of
-    `ModelConfig.overlap_passes` from the clouds with their centroids aligned.
+    With a ``start``, a first idea of the motion, one pass from there. Otherwise
+    `ModelConfig.overlap_passes` from the clouds with their centroids aligned, each from the motion
+    that the matches of the one before ask for.
     """
-    clouds = stack_clouds(source, target)
-    probability, matched = _overlap(params, clouds, dropout_key, start)
+    view = view_of(params.config, stack_clouds(source, target))
+
+    def one_pass(motion, _):
+        logits, matched = look(params, view, motion, dropout_key)
+        after = motion if matched is None else centred(matched.motion, view.centroid)
+        return after, (logits, matched)
+
+    passes = params.config.overlap_passes if start is None else 1
+    still = rigid.identity(view.seen.points.dtype)
+    start = still if start is None else centred(start, view.centroid)
+    _, answers = jax.lax.scan(one_pass, start, length=passes)
+    logits, matched = jax.tree.map(lambda leaf: leaf[-1], answers)
+    probability = probability_of_all(view, logits)
     sizes = source.points.shape[0], target.points.shape[0]
     return probability[0, : sizes[0]], probability[1, : sizes[1]], matched
 
@@ -100,39 +147,6 @@ def register_given_overlap(
     order = jnp.broadcast_to(jnp.arange(size), (2, size))
     probability = jnp.stack([grow(source_overlap, size), grow(target_overlap, size)])
     return _register(params, clouds, order, probability, sizes, dropout_key)
-
-
-def _overlap(
-    params: Params, clouds: Cloud, dropout_key=None, start: Rigid | None = None
-) -> tuple[Float[Array, "2 n"], Matched | None]:
-    """Overlap probabilities in the clouds' own row order, and matches in their own frames."""
-    config = params.config
-    ordered, order, skip_rows, centroid = prepare(clouds, config, config.overlap_points)
-    seen = first_rows(ordered, config.overlap_points)
-    network = OverlapNetwork(config)
-
-    def one_pass(motion, _):
-        moved = move_source(seen, motion)
-        variables = {"params": params.overlap}
-        logits, matched = network.apply(variables, moved, skip_rows, dropout_key)
-        if matched is not None:
-            motion = rigid.compose(matched.motion, motion)
-        return motion, (logits, matched)
-
-    passes = config.overlap_passes if start is None else 1
-    motion = rigid.identity(seen.points.dtype) if start is None else centred(start, centroid)
-    motion, answers = jax.lax.scan(one_pass, motion, length=passes)
-    logits, matched = jax.tree.map(lambda leaf: leaf[-1], answers)
-    size = ordered.points.shape[1]
-    if logits.shape[1] < size:
-        nearest = jax.vmap(interpolation_weights)(ordered.points, seen.points, seen.count)
-        logits = jax.vmap(interpolate)(logits[..., None], *nearest)[..., 0]
-    valid = jax.vmap(lambda count: prefix_mask(size, count))(clouds.count)
-    logits = jnp.take_along_axis(logits, jax.vmap(inverse_order)(order), axis=1)
-    if matched is not None:
-        own = seen._replace(points=seen.points + centroid[:, None, :])
-        matched = matched._replace(clouds=own, motion=uncentred(motion, centroid))
-    return jnp.where(valid, jax.nn.sigmoid(logits), 0.0), matched
 
 
 def select(
@@ -174,8 +188,7 @@ def _register(params, clouds, order, probability, sizes, dropout_key=None) -> Re
     ]
     overlap = jnp.take_along_axis(probability, jax.vmap(inverse_order)(order), axis=1)
     solvable = solvable & jnp.all(count >= 3)
-    identity = rigid.identity(motion.rotation.dtype)
-    motion = jax.tree.map(lambda found, rest: jnp.where(solvable, found, rest), motion, identity)
+    motion = _identity_unless(solvable, motion)
     return Registration(
         rotation=motion.rotation,
         translation=motion.translation,
@@ -188,6 +201,11 @@ def _register(params, clouds, order, probability, sizes, dropout_key=None) -> Re
         confidence=0.5 * (branches[0].confidence + branches[1].confidence),
         valid=solvable,
     )
+
+
+def _identity_unless(valid: Bool[Array, ""], motion: Rigid) -> Rigid:
+    identity = rigid.identity(motion.rotation.dtype)
+    return jax.tree.map(lambda found, rest: jnp.where(valid, found, rest), motion, identity)
 
 
 def _iterate(params: Params, kept: Cloud, dropout_key):

@@ -12,10 +12,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dbdnet_jax.judging import Judgement, near
-from dbdnet_jax.search import Proposal, Rival, Transform, angle_between, move
+from dbdnet_jax.alignment.judging import Judgement, near
+from dbdnet_jax.alignment.search import Proposal, Rival, Transform, angle_between, move
+from dbdnet_jax.weights import PRETRAINED
 
-SUCCESS_FILE = Path(__file__).parent / "pretrained" / "cad_success.json"
+SUCCESS_FILE = PRETRAINED / "cad_success.json"
 SUCCESS_DEG = 5.0  # a pose is right when its rotation is off by less
 
 

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dbdnet_jax.reading import MIN_POINTS
-from dbdnet_jax.search import Transform, as_transform, move
-from dbdnet_jax.thinning import UNIT_SIZE, Thinned, thin
+from dbdnet_jax.alignment.reading import MIN_POINTS
+from dbdnet_jax.alignment.search import Transform, as_transform, move
+from dbdnet_jax.alignment.thinning import UNIT_SIZE, Thinned, thin
 
 Points = Float[np.ndarray, "n 3"]
 OtherPoints = Float[np.ndarray, "m 3"]

@@ -5,9 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
-from dbdnet_jax.judging import Judgement, in_words, written
-from dbdnet_jax.scene import Scene, size_ratio
-from dbdnet_jax.search import Proposal, Rival
+from dbdnet_jax.alignment.judging import Judgement, in_words, written
+from dbdnet_jax.alignment.scene import Scene, size_ratio
+from dbdnet_jax.alignment.search import Proposal, Rival
 
 LOW_OVERLAP, NO_OVERLAP = 0.3, 0.1  # inlier ratios that give a warning, and no valid pose
 UNEQUAL, INCOMPATIBLE = 2.0, 4.0  # sizes of the clouds that do the same
