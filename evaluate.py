@@ -3,11 +3,12 @@
     python evaluate.py --config=configs/cad.py                     # what train.py left in runs/cad
     python evaluate.py --config=configs/cad.py --params=cad        # the weights in the package
     python evaluate.py --config=configs/cad.py --params=mine.npz
+    python evaluate.py --config=configs/cad.py --params=cad --sweep=crop
 
 The configuration's data set and protocol decide the pairs: --config.protocol.noise_sigma=0.0
 scores without noise, --config.protocol.disjoint=True without common points. Scans, of which
 --benchmark=3DLoMatch takes those of little overlap, have a table of registration recall too. All is
-also written to RUN_DIR/evaluation_SET.csv and .json.
+also written to RUN_DIR/evaluation_SET.csv and .json, and with --report drawn on a page beside them.
 """
 
 import shlex
@@ -17,26 +18,50 @@ from pathlib import Path
 from absl import app, flags, logging
 from ml_collections import config_flags
 
-from dbdnet_jax.checkpoint import load_best
+from dbdnet_jax.checkpoint import STAGES, load_best
+from dbdnet_jax.drawing.evaluation_page import evaluation_page
 from dbdnet_jax.evaluation import evaluate
+from dbdnet_jax.extras import MissingExtraError, require_drawing
+from dbdnet_jax.files import write_whole
 from dbdnet_jax.model.params import Params
 from dbdnet_jax.programs import keep_compiled_programs
 from dbdnet_jax.report import render, save
-from dbdnet_jax.settings import parse_flags, read_settings
-from dbdnet_jax.weights import load_params, load_pretrained
+from dbdnet_jax.settings import Settings, parse_flags, read_settings
+from dbdnet_jax.sweep import SWEEP_PAIRS, SWEEPS, render_sweep, save_sweep, sweep
+from dbdnet_jax.weights import PRETRAINED, load_params, load_pretrained
 
 CONFIG = config_flags.DEFINE_config_file("config", None, "Configuration file, configs/NAME.py.")
 RUN_DIR = flags.DEFINE_string("run_dir", None, "The run to score; runs/NAME if not given.")
 PARAMS = flags.DEFINE_string("params", None, "Weights: a .npz file or a name; else the run's best.")
 BENCHMARK = flags.DEFINE_enum("benchmark", "3DMatch", ["3DMatch", "3DLoMatch"], "For scans.")
 COUNT = flags.DEFINE_integer("count", None, "Only the first pairs.", lower_bound=1)
+SWEEP = flags.DEFINE_multi_enum(
+    "sweep", None, list(SWEEPS), "Vary this part of the protocol instead; may be given repeatedly."
+)
+REPORT = flags.DEFINE_bool("report", False, "Draw a page too, with the sweeps saved in RUN_DIR.")
 
 
-def choose_params(params: str | None, run_dir: Path) -> Params:
-    """The weights asked for: a file, a name of weights in the package, or the run's best."""
+def choose_params(params: str | None, run_dir: Path, config_name: str) -> Params:
+    """The weights asked for: a file, or a name of weights in the package.
+
+    Without either the run's best or, where nothing was trained, the package's for the
+    configuration of the same name.
+    """
     if params is None:
-        return load_best(run_dir)
+        trained = any((run_dir / stage / "checkpoints").is_dir() for stage in STAGES)
+        if trained or not (PRETRAINED / f"{config_name}.npz").is_file():
+            return load_best(run_dir)
+        print(f"{run_dir} holds no training; scoring the weights in the package.", file=sys.stderr)
+        params = config_name
     return load_params(params) if params.endswith(".npz") else load_pretrained(params)
+
+
+def run_sweeps(settings: Settings, params: Params, run_dir: Path) -> None:
+    """Print and write one table for each sweep asked for."""
+    for name in SWEEP.value or ():
+        points = list(sweep(name, settings, params, run_dir, COUNT.value or SWEEP_PAIRS))
+        print(render_sweep(name, points), end="\n\n")
+        save_sweep(name, points, run_dir)
 
 
 def main(argv: list[str]) -> None:
@@ -45,21 +70,30 @@ def main(argv: list[str]) -> None:
         raise app.UsageError(f"arguments must be flags such as --params=cad; got {argv[1:]}.")
     logging.set_verbosity(logging.WARNING)
     keep_compiled_programs()
-    config_file = config_flags.get_config_filename(flags.FLAGS["config"])
-    run_dir = Path(RUN_DIR.value or Path("runs") / Path(config_file).stem)
+    config_name = Path(config_flags.get_config_filename(flags.FLAGS["config"])).stem
+    run_dir = Path(RUN_DIR.value or Path("runs") / config_name)
     try:
+        if REPORT.value:
+            require_drawing()
+        settings = read_settings(CONFIG.value)
+        params = choose_params(PARAMS.value, run_dir, config_name)
+        if SWEEP.value:
+            return run_sweeps(settings, params, run_dir)
         evaluation = evaluate(
-            read_settings(CONFIG.value),
-            choose_params(PARAMS.value, run_dir),
+            settings,
+            params,
             run_dir,
             command=shlex.join(["python", *sys.argv]),
             benchmark=BENCHMARK.value,
             count=COUNT.value,
         )
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, MissingExtraError) as error:
         sys.exit(f"error: {error}")
     print(render(evaluation))
     save(evaluation, run_dir)
+    if REPORT.value:
+        page = run_dir / f"evaluation_{evaluation.pair_set}.html"
+        write_whole(page, evaluation_page(evaluation, run_dir))
 
 
 if __name__ == "__main__":

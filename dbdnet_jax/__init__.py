@@ -4,6 +4,7 @@ The public surface is what this module exports; everything else may change.
 """
 
 from dbdnet_jax.align import Alignment, align
+from dbdnet_jax.align_many import MultiAlignment, align_many
 from dbdnet_jax.model.dbdnet import register
 from dbdnet_jax.released import from_released, to_released
 from dbdnet_jax.types import Registration
@@ -12,8 +13,10 @@ from dbdnet_jax.weights import load_params, load_pretrained, save_params
 __version__ = "0.1.0"
 __all__ = [
     "Alignment",
+    "MultiAlignment",
     "Registration",
     "align",
+    "align_many",
     "from_released",
     "load_params",
     "load_pretrained",

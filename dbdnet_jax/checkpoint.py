@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dbdnet_jax.files import write_whole
 from dbdnet_jax.model.config import ModelConfig
 from dbdnet_jax.model.params import Params
 from dbdnet_jax.safe_pickle import CheckpointError
@@ -128,9 +129,7 @@ def write_stage(folder: Path, record: dict[str, Any]) -> None:
     record = json.loads(json.dumps(record))
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        part = path.with_suffix(".part")
-        part.write_text(json.dumps(record, indent=1) + "\n")
-        part.replace(path)
+        write_whole(path, (json.dumps(record, indent=1) + "\n").encode())
         return
     found = _flatten(read_stage(folder))
     wanted = _flatten(record)

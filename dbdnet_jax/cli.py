@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from dbdnet_jax.align import Alignment
 
 ALIGNED, UNSURE, UNUSABLE, INTERRUPTED = 0, 1, 2, 130
@@ -19,13 +21,15 @@ examples:
   dbdnet-register scan_a.ply scan_b.ply
   dbdnet-register a.xyz b.xyz -o T.txt --save-aligned a_on_b.ply
   dbdnet-register part.stl scan.ply --json > answer.json
-  dbdnet-register --batch pairs.txt -o transforms/
+  dbdnet-register scan_a.ply scan_b.ply --report report.html --png report.png
+  dbdnet-register --batch pairs.txt -o transforms/ --report pages/
 
 A file is a cloud (.ply .pcd .xyz .txt .csv .npy .npz) or a mesh (.ply .obj .off .stl .glb), of any
 size; both in the same unit. The transform T is 4x4: B ~ T A.
 
 A batch is a text file with two paths a line (from its own folder; # comments), or a folder whose
-files are named NAME_source.* and NAME_target.*; transforms go to FOLDER/NAME.txt.
+files are named NAME_source.* and NAME_target.*; transforms go to FOLDER/NAME.txt, reports to
+FOLDER/NAME.html and pictures to FOLDER/NAME.png.
 
 exit status: 0 aligned, 1 not aligned with confidence (of a batch: not all), 2 unusable input.
 """
@@ -38,6 +42,8 @@ class Job(NamedTuple):
     target: Path
     transform: Path | None
     aligned: Path | None
+    report: Path | None
+    picture: Path | None
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -46,15 +52,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     parser = _parser()
+    argv = sys.argv[1:] if argv is None else argv
     options = parser.parse_args(argv)
+    options.command = shlex.join(["dbdnet-register", *argv])
     if (options.batch is None) != (len(options.clouds) == 2) or len(options.clouds) not in (0, 2):
         parser.error("give two clouds, or --batch")
     if options.batch is not None and options.save_aligned is not None:
         parser.error("--save-aligned is for one pair, not for --batch")
     try:
-        jobs = list(_jobs(options))
+        jobs = _jobs(options)
         settings = _settings(options)
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, ImportError) as error:
         return _complain(error)
     except KeyboardInterrupt:
         return INTERRUPTED
@@ -76,6 +84,8 @@ def _parser() -> argparse.ArgumentParser:
     add("clouds", nargs="*", type=Path, metavar="CLOUD", help="source A and target B")
     add("-o", "--output", type=Path, metavar="T", help="transform: .txt .json .npy; batch: folder")
     add("--save-aligned", type=Path, metavar="PLY", help="write the moved source")
+    add("--report", type=Path, metavar="HTML", help="write a page to look at; batch: folder")
+    add("--png", type=Path, metavar="PNG", help="write a picture; batch: folder")
     add("--batch", type=Path, metavar="PAIRS", help="a list of pairs, or a folder")
     add("--json", action="store_true", help="print JSON, a line for each pair, instead of text")
     add("--params", default="cad", metavar="W", help="weights: a .npz file, or a name (cad)")
@@ -111,26 +121,39 @@ def _settings(options: argparse.Namespace) -> dict:
     }
 
 
-def _jobs(options: argparse.Namespace) -> Iterator[Job]:
+def _jobs(options: argparse.Namespace) -> list[Job]:
     """The pairs that are asked for; their outputs are checked before any work is done."""
     from dbdnet_jax.writing import TRANSFORM_ENDINGS, check_output
 
+    if options.report or options.png:
+        from dbdnet_jax.extras import require_drawing
+
+        require_drawing()
+    outputs = options.output, options.save_aligned, options.report, options.png
     if options.batch is None:
-        outputs = options.output, options.save_aligned
-        for path, endings in zip(outputs, (TRANSFORM_ENDINGS, (".ply",)), strict=True):
+        source, target = options.clouds
+        jobs = [Job(source, target, *outputs)]
+    else:
+        jobs = [
+            Job(
+                source,
+                target,
+                *(
+                    folder and folder / f"{name}{ending}"
+                    for folder, ending in zip(outputs, (".txt", "", ".html", ".png"), strict=True)
+                ),
+            )
+            for name, source, target in _pairs(options.batch)
+        ]
+        if not jobs:
+            raise ValueError(f"a batch must have at least one pair; {options.batch} has none.")
+    for job in jobs:
+        for path, endings in zip(
+            job[2:], (TRANSFORM_ENDINGS, (".ply",), (".html",), (".png",)), strict=True
+        ):
             if path is not None:
                 check_output(path, endings)
-        source, target = options.clouds
-        yield Job(source, target, options.output, options.save_aligned)
-        return
-    pairs = list(_pairs(options.batch))
-    if not pairs:
-        raise ValueError(f"a batch must have at least one pair; {options.batch} has none.")
-    for name, source, target in pairs:
-        path = None if options.output is None else options.output / f"{name}.txt"
-        if path is not None:
-            check_output(path, TRANSFORM_ENDINGS)
-        yield Job(source, target, path, None)
+    return jobs
 
 
 def _pairs(batch: Path) -> Iterator[tuple[str, Path, Path]]:
@@ -165,11 +188,13 @@ def _run(job: Job, options: argparse.Namespace, settings: dict) -> int:
     print(f"{job.source} -> {job.target} ...", file=sys.stderr)
     try:
         source = read_points(job.source, "source", seed=options.seed)
-        alignment = align(source, job.target, **settings)
+        target = read_points(job.target, "target", seed=options.seed + 1)
+        alignment = align(source, target, **settings)
         if job.transform is not None:
             write_transform(job.transform, alignment)
         if job.aligned is not None:
             write_ply(job.aligned, source @ alignment.rotation.T + alignment.translation)
+        _draw(job, alignment, source, target, options.command)
     except (ValueError, OSError, ImportError, MemoryError) as error:
         return _complain(error)
     if options.json:
@@ -178,6 +203,24 @@ def _run(job: Job, options: argparse.Namespace, settings: dict) -> int:
     else:
         print(summary(job.source, job.target, alignment))
     return ALIGNED if alignment.valid else UNSURE
+
+
+def _draw(
+    job: Job, alignment: "Alignment", source: "np.ndarray", target: "np.ndarray", command: str
+) -> None:
+    """Write the page and the picture that are asked for."""
+    from dbdnet_jax.files import write_whole
+
+    names = str(job.source), str(job.target)
+    if job.report is not None:
+        from dbdnet_jax.drawing.alignment_page import alignment_page
+
+        page = alignment_page(alignment, source, target, names=names, command=command)
+        write_whole(job.report, page)
+    if job.picture is not None:
+        from dbdnet_jax.drawing.picture import alignment_picture
+
+        write_whole(job.picture, alignment_picture(alignment, source, target, names=names))
 
 
 def summary(source: Path, target: Path, alignment: "Alignment") -> str:

@@ -9,22 +9,24 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float
 from tqdm import tqdm
 
 from dbdnet_jax.baselines.classical import (
-    MissingBaselineError,
     fgr,
     fgr_estimated,
     icp,
     icp_centred,
     identity,
 )
+from dbdnet_jax.extras import MissingExtraError
 from dbdnet_jax.metrics import (
     OverlapSummary,
     PairErrors,
     Summary,
     motion_errors,
     pair_confusion,
+    point_distance,
     registration_errors,
     summarise,
     summarise_overlap,
@@ -43,7 +45,8 @@ Method = Callable[[Pair], Rigid | Registration]
 class Row(NamedTuple):
     """One method's line of a table; without a summary, the note says why it could not run.
 
-    ``recall`` is there for pairs of scans only.
+    ``recall`` is there for pairs of scans only. ``errors``, ``motions`` and the `point_distance`
+    have a leading axis of pairs.
     """
 
     method: str
@@ -51,6 +54,9 @@ class Row(NamedTuple):
     seconds_per_pair: float | None
     note: str = ""
     recall: ScanRecall | None = None
+    errors: PairErrors | None = None
+    motions: Rigid | None = None
+    point_distance: Float[np.ndarray, " pairs"] | None = None
 
 
 class Evaluation(NamedTuple):
@@ -64,6 +70,8 @@ class Evaluation(NamedTuple):
     seed: int
     command: str
     device: str
+    test_pairs: Pair | None = None
+    symmetric: Bool[np.ndarray, " pairs"] | None = None  # whether a turn keeps the pair's shape
 
 
 def evaluate(
@@ -88,17 +96,17 @@ def evaluate(
             "an evaluation needs a registration network; these params hold only the overlap "
             "network. Train it too: python train.py --stage=registration"
         )
-    name, pairs, digest, scans = load_test_pairs(settings, run_dir, benchmark)
+    name, pairs, digest, scans, symmetric = load_test_pairs(settings, run_dir, benchmark)
     if count is not None and count < len(pairs.source.count):
         name = f"{name}_first_{count}"
         pairs = jax.tree.map(lambda leaf: leaf[:count], pairs)
         scans = scans and scans.first(count)
+        symmetric = symmetric if symmetric is None else symmetric[:count]
     methods = make_methods(params, settings.train.seed)
     if not pairs.source_normals.any():  # scans come without
         del methods["FGR, true normals"]
-    # The lengths of `polish` are those of a shape in the unit sphere.
-    if scans is None and params.overlap is not None:
-        methods["DBDNet, polished"] = from_polished_network(params)
+    if scans is not None:  # the lengths of `polish` are those of a shape in the unit sphere
+        methods.pop("DBDNet, polished", None)
     return Evaluation(
         rows=evaluate_methods(methods, pairs, scans),
         constant_overlap=constant_overlap(pairs),
@@ -108,6 +116,8 @@ def evaluate(
         seed=settings.train.seed,
         command=command,
         device=f"{jax.devices()[0].device_kind}, {os.cpu_count()} cores",
+        test_pairs=pairs,
+        symmetric=symmetric,
     )
 
 
@@ -120,7 +130,7 @@ def make_methods(params: Params, seed: int) -> dict[str, Method]:
     network, name = from_network, "DBDNet"
     if params.overlap is None:
         network, name = from_true_overlap, "DBDNet, true overlap given"
-    return {
+    methods = {
         "identity": from_points(identity),
         "ICP": from_points(icp),
         "ICP, centroids first": from_points(icp_centred),
@@ -129,6 +139,9 @@ def make_methods(params: Params, seed: int) -> dict[str, Method]:
         f"{name} (untrained)": network(untrained),
         name: network(params),
     }
+    if params.overlap is not None:
+        methods["DBDNet, polished"] = from_polished_network(params)
+    return methods
 
 
 def from_points(baseline: Callable[..., Rigid]) -> Method:
@@ -189,6 +202,7 @@ def evaluate_method(name: str, method: Method, pairs: Pair, scans: Scans | None 
     """
     score = jax.jit(_score)
     errors: list[PairErrors] = []
+    motions: list[Rigid] = []
     seconds: list[float] = []
     rmse_m: list[float] = []
     try:
@@ -198,16 +212,25 @@ def evaluate_method(name: str, method: Method, pairs: Pair, scans: Scans | None 
             start = time.perf_counter()
             answer = jax.block_until_ready(method(pair))
             seconds.append(time.perf_counter() - start)
+            motions.append(Rigid(answer.rotation, answer.translation))
             errors.append(jax.device_get(score(answer, pair)))
             if scans is not None:
                 rmse_m.append(correspondence_rmse_m(answer, *scans.correspondences[i]))
-    except MissingBaselineError as error:
+    except MissingExtraError as error:
         return Row(name, None, None, str(error))
-    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *errors)
-    recall = None
-    if scans is not None:
-        recall = scan_recall(stacked.rotation_deg, stacked.translation, np.array(rmse_m), scans)
-    return Row(name, summarise(stacked), float(np.median(seconds)), recall=recall)
+    stacked, moved = (
+        jax.tree.map(lambda *leaves: np.stack(leaves), *found) for found in (errors, motions)
+    )
+    row = Row(name, summarise(stacked), float(np.median(seconds)), errors=stacked, motions=moved)
+    if scans is None:
+        return row._replace(point_distance=np.asarray(_point_distances(moved, pairs)))
+    recall = scan_recall(stacked.rotation_deg, stacked.translation, np.array(rmse_m), scans)
+    return row._replace(recall=recall)
+
+
+@jax.jit
+def _point_distances(motions: Rigid, pairs: Pair) -> Float[Array, " pairs"]:
+    return jax.lax.map(lambda pair: point_distance(*pair), (motions, pairs))
 
 
 def evaluate_methods(

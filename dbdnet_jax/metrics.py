@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from dbdnet_jax.ops import rigid
+from dbdnet_jax.ops.grouping import squared_distances
 from dbdnet_jax.ops.rigid import HIGHEST
 from dbdnet_jax.ops.sampling import prefix_mask
 from dbdnet_jax.types import Pair, Registration, Rigid
@@ -137,11 +139,7 @@ def motion_errors(predicted: Rigid, truth: Rigid) -> PairErrors:
 
     Euler differences are plain differences of the angles, not wrapped, as in the paper.
     """
-    finite = jnp.isfinite(predicted.rotation).all() & jnp.isfinite(predicted.translation).all()
-    scored = Rigid(
-        jnp.where(finite, predicted.rotation, truth.rotation),
-        jnp.where(finite, predicted.translation, -truth.translation),
-    )
+    scored, finite = _scored(predicted, truth)
     euler = jnp.abs(euler_xyz_deg(scored.rotation) - euler_xyz_deg(truth.rotation))
     zero = jnp.zeros((), jnp.int32)
     return PairErrors(
@@ -152,6 +150,35 @@ def motion_errors(predicted: Rigid, truth: Rigid) -> PairErrors:
         finite=finite,
         overlap=Confusion(zero, zero, zero, zero),
     )
+
+
+def point_distance(predicted: Rigid, pair: Pair) -> Float[Array, ""]:
+    """Mean distance from the moved source points to the nearest point of both clouds together.
+
+    Both in their true places, in the units of the clouds: what a pose is off by where a symmetry
+    of the shape is forgiven. Noise, and how far apart the points are, keep it above zero.
+    """
+    scored, _ = _scored(predicted, pair.target_from_source)
+    rows, columns = (
+        prefix_mask(cloud.points.shape[0], cloud.count) for cloud in (pair.source, pair.target)
+    )
+    source = jnp.where(rows[:, None], pair.source.points, 0.0)
+    moved, true = rigid.apply(scored, source), rigid.apply(pair.target_from_source, source)
+    nearest = jnp.minimum(
+        jnp.min(jnp.where(rows[None, :], squared_distances(moved, true), jnp.inf), axis=1),
+        jnp.min(
+            jnp.where(columns[None, :], squared_distances(moved, pair.target.points), jnp.inf),
+            axis=1,
+        ),
+    )
+    return jnp.sum(jnp.where(rows, jnp.sqrt(nearest), 0.0)) / jnp.maximum(jnp.sum(rows), 1)
+
+
+def _scored(predicted: Rigid, truth: Rigid) -> tuple[Rigid, Bool[Array, ""]]:
+    """The motion that is scored, see the top of this file, and whether it is the predicted one."""
+    finite = jnp.isfinite(predicted.rotation).all() & jnp.isfinite(predicted.translation).all()
+    rotation = jnp.where(finite, predicted.rotation, truth.rotation)
+    return Rigid(rotation, jnp.where(finite, predicted.translation, -truth.translation)), finite
 
 
 def pair_confusion(

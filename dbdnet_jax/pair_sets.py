@@ -6,10 +6,13 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Bool
 
 from dbdnet_jax.data.cad import HALVES, cad_split
 from dbdnet_jax.data.frozen import CAD_VARIANTS, cad_test_pairs, freeze, thaw
 from dbdnet_jax.data.modelnet40 import load_modelnet40
+from dbdnet_jax.data.shapes import Shapes
+from dbdnet_jax.data.symmetry import symmetric_shapes
 from dbdnet_jax.data.threedmatch import load_correspondences, load_info, load_pair
 from dbdnet_jax.recall import Scans
 from dbdnet_jax.settings import Settings
@@ -22,13 +25,15 @@ CAD_PAIRS = 200
 class PairSet(NamedTuple):
     """Stacked NumPy pairs (leading axis on every field), what they are, and their sha256.
 
-    ``scans`` is there for pairs of scans only.
+    ``scans`` is there for pairs of scans only, ``symmetric`` for pairs of shapes: whether a turn
+    brings the shape onto itself.
     """
 
     name: str
     pairs: Pair
     digest: str
     scans: Scans | None = None
+    symmetric: Bool[np.ndarray, " pairs"] | None = None
 
 
 def load_test_pairs(settings: Settings, run_dir: str | Path, benchmark: str = "3DMatch") -> PairSet:
@@ -50,7 +55,9 @@ def load_test_pairs(settings: Settings, run_dir: str | Path, benchmark: str = "3
     if data.name == "cad":
         for variant, (frozen_protocol, frozen_half) in CAD_VARIANTS.items():
             if (protocol, half) == (frozen_protocol, frozen_half):
-                return PairSet(f"cad_test_{variant}", *cad_test_pairs(variant))
+                pairs, digest = cad_test_pairs(variant)
+                symmetric = _symmetric(cad_split("test", half), len(pairs.source.count))
+                return PairSet(f"cad_test_{variant}", pairs, digest, symmetric=symmetric)
         shapes, count = cad_split("test", half), CAD_PAIRS
     else:
         shapes = load_modelnet40(data.folder, "test", half or "all")
@@ -58,7 +65,12 @@ def load_test_pairs(settings: Settings, run_dir: str | Path, benchmark: str = "3
     path = Path(run_dir) / f"{name}.npz"
     path.parent.mkdir(parents=True, exist_ok=True)
     freeze(path, shapes, protocol, seed=TEST_SEED, count=count)
-    return PairSet(name, *thaw(path, shapes))
+    return PairSet(name, *thaw(path, shapes), symmetric=_symmetric(shapes, count))
+
+
+def _symmetric(shapes: Shapes, count: int) -> Bool[np.ndarray, " count"]:
+    """Whether the shape of each pair is symmetric; a frozen set takes the shapes in turn."""
+    return symmetric_shapes(shapes.points)[np.arange(count) % len(shapes)]
 
 
 def _scans(settings: Settings, benchmark: str, cache: Path) -> PairSet:

@@ -10,7 +10,7 @@ from jax import export
 
 from dbdnet_jax.files import cache_folder, write_whole
 
-TRACED = ("model/*.py", "ops/*.py", "types.py", "search.py")
+TRACED = ("model/*.py", "ops/*.py", "types.py", "alignment/search.py")
 
 
 def keep_compiled_programs() -> None:

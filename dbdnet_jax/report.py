@@ -7,12 +7,14 @@ hash of the test pairs that it came from.
 import csv
 import io
 import json
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from dbdnet_jax.evaluation import Evaluation, Row
+from dbdnet_jax.files import write_whole
 from dbdnet_jax.metrics import OverlapSummary, Summary
 from dbdnet_jax.recall import ScanRecall
 
@@ -92,12 +94,37 @@ Probability > 0.5 counts as overlapping; TP, FP, FN pooled over the points of bo
 pairs."""
 
 
-def render(evaluation: Evaluation) -> str:
-    """The tables as fixed-width text, with the definitions and where the figures come from."""
+SYMMETRY_HEADS = (
+    ("Error R", "mean", "deg"),
+    ("Error R", "median", "deg"),
+    ("Error t", "mean", "unit"),
+    ("Points", "mean", "unit"),
+)
+SYMMETRY_DEFINITIONS = """\
+A shape is symmetric when a turn of 30 degrees or more about its main axes brings it onto itself:
+its rotation has no single right answer. Points: mean distance from the moved source points to the
+nearest point of both clouds in their true places, which forgives such a turn."""
+
+
+class Table(NamedTuple):
+    """Heads of three lines, a line of cells for each method, and what to read below them."""
+
+    title: str
+    heads: Sequence[tuple[str, str, str]]
+    body: Sequence[Sequence[str]]
+    notes: Sequence[str]
+
+
+def tables(evaluation: Evaluation) -> list[Table]:
+    """Errors of the motion; then, where there are any, registration recall and overlap."""
     rows = evaluation.rows
-    parts = [_of_columns("method", MOTION_COLUMNS, rows), DEFINITIONS, *_remarks(rows)]
+    notes = [DEFINITIONS, *_remarks(rows)]
+    found = [_of_columns("Errors", "method", MOTION_COLUMNS, rows, notes)]
     if any(row.recall for row in rows):
-        parts += ["", _of_columns("registration recall", RECALL_COLUMNS, rows), RECALL_DEFINITIONS]
+        head, notes = "registration recall", [RECALL_DEFINITIONS]
+        found.append(_of_columns("Registration recall", head, RECALL_COLUMNS, rows, notes))
+    if evaluation.symmetric is not None:
+        found.append(_by_symmetry(rows, np.asarray(evaluation.symmetric)))
     predicted = [
         (row.method, row.summary.overlap)
         for row in rows
@@ -109,19 +136,58 @@ def render(evaluation: Evaluation) -> str:
             [name, *(f"{value:.4f}" for value in overlap)]
             for name, overlap in [*predicted, (CONSTANT_NAME, constant)]
         ]
-        parts += ["", _table([("overlap prediction", "", ""), *OVERLAP_HEADS], body)]
-        parts.append(OVERLAP_DEFINITIONS)
-        parts += [
+        unskilled = [
             f"{name}: accuracy and F1 are not both above those of the constant answer, so they "
             "show no skill at finding the overlap."
             for name, overlap in predicted
             if overlap.accuracy <= constant.accuracy or overlap.f1 <= constant.f1
         ]
-    return "\n".join([*parts, "", _provenance(evaluation)])
+        heads = [("overlap prediction", "", ""), *OVERLAP_HEADS]
+        found.append(Table("Overlap prediction", heads, body, [OVERLAP_DEFINITIONS, *unskilled]))
+    return found
+
+
+def _by_symmetry(rows: Sequence[Row], symmetric: np.ndarray) -> Table:
+    """Errors on the pairs of shapes without a symmetry, and on the others."""
+    kinds = {"plain": ~symmetric, "symmetric": symmetric}
+    kinds = {kind: chosen for kind, chosen in kinds.items() if chosen.any()}
+    heads = [("by symmetry", "", "")]
+    for kind in kinds:
+        heads += [(f"{name} {kind}", of, unit) for name, of, unit in SYMMETRY_HEADS]
+    body = []
+    for row in rows:
+        if row.errors is None or row.point_distance is None:
+            continue
+        cells = [row.method]
+        for chosen in kinds.values():
+            rotation = row.errors.rotation_deg[chosen]
+            translation = row.errors.translation[chosen]
+            cells += [
+                f"{rotation.mean():.3f}",
+                f"{np.median(rotation):.3f}",
+                f"{translation.mean():.4f}",
+                f"{row.point_distance[chosen].mean():.4f}",
+            ]
+        body.append(cells)
+    counts = ", ".join(f"{chosen.sum()} {kind}" for kind, chosen in kinds.items())
+    return Table(
+        "Symmetric shapes apart", heads, body, [f"Pairs: {counts}. " + SYMMETRY_DEFINITIONS]
+    )
+
+
+def render(evaluation: Evaluation) -> str:
+    """The tables as fixed-width text, with the definitions and where the figures come from."""
+    parts = [
+        part
+        for table in tables(evaluation)
+        for part in (_fixed_width(table.heads, table.body), *table.notes, "")
+    ]
+    return "\n".join([*parts, _provenance(evaluation)])
 
 
 def save(evaluation: Evaluation, folder: str | Path) -> None:
     """Write ``evaluation_SET.csv`` and ``.json`` into ``folder``, named by the set of pairs."""
+    Path(folder).mkdir(parents=True, exist_ok=True)
     stem = Path(folder) / f"evaluation_{evaluation.pair_set}"
     write_csv(stem.with_suffix(".csv"), evaluation)
     write_json(stem.with_suffix(".json"), evaluation)
@@ -138,23 +204,27 @@ def write_csv(path: str | Path, evaluation: Evaluation) -> None:
     writer = csv.DictWriter(text, [*lines[0], *provenance], lineterminator="\n")
     writer.writeheader()
     writer.writerows(line | provenance for line in lines)
-    _write_atomically(Path(path), text.getvalue())
+    write_whole(Path(path), text.getvalue().encode())
 
 
 def write_json(path: str | Path, evaluation: Evaluation) -> None:
     """The same figures as one JSON object: provenance, then ``rows``; atomic."""
     lines = [*(_flat(row) for row in evaluation.rows), _flat_constant(evaluation)]
     content = _provenance_fields(evaluation) | {"rows": lines}
-    _write_atomically(Path(path), json.dumps(content, indent=1, allow_nan=False) + "\n")
+    text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+    write_whole(Path(path), text.encode())
 
 
-def _of_columns(name: str, columns: Sequence[Column], rows: Sequence[Row]) -> str:
+def _of_columns(
+    title: str, first: str, columns: Sequence[Column], rows: Sequence[Row], notes: Sequence[str]
+) -> Table:
     """A table of one line for each method."""
-    heads = [(name, "", ""), *(column.head for column in columns)]
-    return _table(heads, [[row.method, *(column.cell(row) for column in columns)] for row in rows])
+    heads = [(first, "", ""), *(column.head for column in columns)]
+    body = [[row.method, *(column.cell(row) for column in columns)] for row in rows]
+    return Table(title, heads, body, notes)
 
 
-def _table(heads: Sequence[tuple[str, str, str]], body: Sequence[Sequence[str]]) -> str:
+def _fixed_width(heads: Sequence[tuple[str, str, str]], body: Sequence[Sequence[str]]) -> str:
     """Fixed-width columns two spaces apart, the first to the left, the others to the right."""
     lines = [list(line) for line in zip(*heads, strict=True)]
     widths = [max(map(len, cells)) for cells in zip(*lines, *body, strict=True)]
@@ -187,7 +257,7 @@ def _provenance_fields(evaluation: Evaluation) -> dict[str, Any]:
     return {
         key: value
         for key, value in evaluation._asdict().items()
-        if key not in ("rows", "constant_overlap")
+        if key not in ("rows", "constant_overlap", "test_pairs", "symmetric")
     }
 
 
@@ -215,14 +285,3 @@ def _flat_overlap(overlap: OverlapSummary | None) -> dict[str, Any]:
 
 def _flat_constant(evaluation: Evaluation) -> dict[str, Any]:
     return _flat(Row(CONSTANT_NAME, None, None)) | _flat_overlap(evaluation.constant_overlap)
-
-
-def _write_atomically(path: Path, text: str) -> None:
-    """Write beside ``path``, then move: a reader sees the whole file or the one before."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        part.write_text(text, encoding="utf-8")
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)

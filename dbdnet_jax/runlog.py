@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from dbdnet_jax.files import write_whole
+
 
 class RunLog:
     """Rows of scalars by step, in ``folder/NAME.csv`` and ``folder/tensorboard``.
@@ -43,10 +45,7 @@ def _truncate(path: Path, last: int) -> None:
     """Drop the rows after step ``last``, and a row torn by a kill."""
     head, *rows = path.read_text().splitlines(keepends=True)
     kept = [row for row in rows if row.endswith("\n") and int(row.split(",")[0]) <= last]
-    part = path.with_suffix(".part")
-    part.write_text("".join([head, *kept]) if kept else "")
     if kept:
-        part.replace(path)
+        write_whole(path, "".join([head, *kept]).encode())
     else:
-        part.unlink()
         path.unlink()

@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -172,3 +173,63 @@ def test_the_examples_are_scans_of_one_shape():
     found = tiny_align(source, target, initial=true)
     assert rotation_error_deg(found.transform, true) < 3
     assert found.inlier_ratio > 0.5
+
+
+needs_report = pytest.mark.skipif(
+    not (find_spec("plotly") and find_spec("matplotlib")),
+    reason="the report extra is not installed",
+)
+PNG, HTML = b"\x89PNG\r\n", b"<!DOCTYPE html>"
+
+
+@needs_report
+def test_a_page_and_a_picture_are_written(run, tmp_path):
+    run("a.ply", "b.ply", "--report", tmp_path / "r.html", "--png", tmp_path / "r.png")
+    page = (tmp_path / "r.html").read_bytes()
+    assert page.startswith(HTML) and b"dbdnet-register a.ply b.ply --report" in page
+    assert (tmp_path / "r.png").read_bytes().startswith(PNG)
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+@needs_report
+def test_a_batch_writes_its_pages_and_pictures_into_folders(run, folder, tmp_path):
+    (tmp_path / "pairs.txt").write_text(f"{folder}/a.ply {folder}/b.ply\n")
+    run("--batch", tmp_path / "pairs.txt", "--report", tmp_path, "--png", tmp_path, batch=True)
+    assert (tmp_path / "0001_a_b.html").read_bytes().startswith(HTML)
+    assert (tmp_path / "0001_a_b.png").read_bytes().startswith(PNG)
+
+
+@needs_report
+@pytest.mark.parametrize(
+    ("flag", "output", "message"),
+    [
+        ("--report", "page.pdf", "must be one of .html; got page.pdf"),
+        ("--png", "picture.jpg", "must be one of .png; got picture.jpg"),
+        ("--report", "missing/page.html", "the folder of an output must exist"),
+    ],
+)
+def test_an_output_that_cannot_be_is_refused_before_any_work(
+    run, monkeypatch, flag, output, message
+):
+    monkeypatch.setattr(ALIGN, "align", lambda *_, **__: pytest.fail("worked"))
+    status, _, err = run("a.ply", "b.ply", flag, output)
+    assert status == UNUSABLE and message in err
+
+
+@pytest.mark.parametrize("flag", ["--report=r.html", "--png=r.png"])
+def test_a_missing_extra_is_said_before_any_work(run, monkeypatch, flag):
+    monkeypatch.setitem(sys.modules, "plotly", None)
+    monkeypatch.setattr(ALIGN, "align", lambda *_, **__: pytest.fail("worked"))
+    status, _, err = run("a.ply", "b.ply", flag)
+    assert status == UNUSABLE and 'pip install "dbdnet_jax[report]"' in err
+
+
+@needs_report
+def test_a_full_disk_leaves_no_page(run, tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    status, _, err = run("a.ply", "b.ply", "--report", tmp_path / "r.html")
+    assert status == UNUSABLE and "No space left" in err
+    assert not list(tmp_path.iterdir())

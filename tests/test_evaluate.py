@@ -129,7 +129,7 @@ def test_params_without_a_registration_network_are_refused(tmp_path):
 def test_the_script_prints_the_table_and_writes_it(tmp_path):
     save_params(tmp_path / "tiny.npz", tiny_params())
     flags = f"--params={tmp_path}/tiny.npz", f"--run_dir={tmp_path}", "--config.protocol.points=128"
-    done = run(*flags, "--count=2")
+    done = run(*flags, "--count=2", "--report")
     assert done.returncode == 0, done.stderr
     for method in ("identity", "ICP", "FGR, true normals", "DBDNet (untrained)", "DBDNet "):
         assert f"\n{method}" in done.stdout
@@ -140,6 +140,8 @@ def test_the_script_prints_the_table_and_writes_it(tmp_path):
         "DBDNet", "DBDNet (untrained)", "all points overlapping (constant)",
     }  # fmt: skip
     assert (tmp_path / "evaluation_cad_test_all_first_2.csv").is_file()
+    page = (tmp_path / "evaluation_cad_test_all_first_2.html").read_text()
+    assert page.startswith("<!DOCTYPE html>") and "Worst pair" in page
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from dbdnet_jax import metrics
@@ -216,3 +217,19 @@ def test_registration_errors_under_jit_and_vmap_are_those_of_a_loop():
         )
     )
     assert int(np.sum(together.overlap.true_positive)) == hits
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_point_distance_against_a_search_tree(seed):
+    answer, pair = answer_and_pair(seed)
+    predicted = Rigid(answer.rotation, answer.translation)
+    source, target = np.asarray(pair.source.points[:5]), np.asarray(pair.target.points[:3])
+    true, moved = (
+        source @ np.asarray(motion.rotation).T + np.asarray(motion.translation)
+        for motion in (pair.target_from_source, predicted)
+    )
+    expected = cKDTree(np.concatenate([true, target])).query(moved)[0].mean()
+    assert_close(metrics.point_distance(predicted, pair), expected, FLOAT32)
+    assert metrics.point_distance(pair.target_from_source, pair) == 0.0
+    broken = predicted._replace(rotation=predicted.rotation * np.nan)
+    assert np.isfinite(metrics.point_distance(broken, pair))

@@ -91,7 +91,7 @@ def test_pcd_is_read_where_open3d_is(tmp_path):
 def test_pcd_without_open3d_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
     (tmp_path / "a.pcd").write_bytes(b"# .PCD")
-    with pytest.raises(ImportError, match=r"need Open3D.*pip install"):
+    with pytest.raises(ImportError, match=r"needs Open3D.*pip install"):
         read_points(tmp_path / "a.pcd")
 
 

@@ -116,21 +116,22 @@ def test_scans_have_their_registration_recall_by_either_definition(pairs):
     assert identity == ScanRecall(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def oracle_network(params, src, tgt, src_mask, tgt_mask) -> Registration:
-    """Stands for `register`: the true motion of copies, ``params.overlap`` at every row."""
-    motion, _ = rigid.procrustes(
-        jnp.where(src_mask[:, None], src, 0), tgt, src_mask.astype(jnp.float32)
-    )
+def oracle_network(params, source, target, weights=None) -> Registration:
+    """Stands for `register_clouds`: the true motion of copies, ``params.overlap`` at every row."""
+    mask = jnp.arange(ROWS) < source.count
+    weights = mask.astype(jnp.float32) if weights is None else weights
+    points = jnp.where(mask[:, None], source.points, 0)
+    motion, _ = rigid.procrustes(points, target.points, weights)
     zeros = jnp.zeros(ROWS)
     branch = Branch(jnp.zeros((ROWS, ROWS)), jnp.zeros((ROWS, 3)), zeros)
     overlap = jnp.full(ROWS, params.overlap)
     return Registration(
-        *motion, overlap, overlap, src_mask, tgt_mask, branch, branch, zeros, jnp.asarray(True)
+        *motion, overlap, overlap, mask, mask, branch, branch, zeros, jnp.asarray(True)
     )
 
 
-def test_the_network_is_given_masks_and_scored_on_motion_and_overlap(pairs, monkeypatch):
-    monkeypatch.setattr(evaluation, "register", oracle_network)
+def test_the_network_is_scored_on_motion_and_overlap(pairs, monkeypatch):
+    monkeypatch.setattr(evaluation, "register_clouds", oracle_network)
     row = evaluate_method("network", from_network(STAND_IN), pairs)
     assert_close(row.summary.error_translation, np.zeros(()), FLOAT32)
     assert_close(row.summary.overlap, constant_overlap(pairs), FLOAT32)
@@ -138,9 +139,7 @@ def test_the_network_is_given_masks_and_scored_on_motion_and_overlap(pairs, monk
 
 def test_the_registration_network_can_be_given_the_true_overlap(pairs, monkeypatch):
     def given_overlap(params, source, target, source_overlap, target_overlap) -> Registration:
-        return oracle_network(
-            params, source.points, target.points, source_overlap > 0.5, target_overlap > 0.5
-        )
+        return oracle_network(params, source, target, source_overlap * target_overlap)
 
     monkeypatch.setattr(evaluation, "register_given_overlap", given_overlap)
     row = evaluate_method("told", from_true_overlap(STAND_IN), pairs)
@@ -210,29 +209,45 @@ def test_registration_recall_has_a_table_of_its_own():
     assert "registration recall" not in reports.render(make_evaluation(*ROWS_OF_ALL_KINDS))
 
 
+def test_symmetric_shapes_have_a_table_of_their_own(pairs):
+    row = evaluate_method("identity", from_points(classical.identity), pairs)
+    evaluation = make_evaluation(row)._replace(symmetric=np.array([True, False, True]))
+    text = reports.render(evaluation)
+    plain, symmetric = row.errors.rotation_deg[1], row.errors.rotation_deg[[0, 2]].mean()
+    (line,) = [line for line in text.splitlines() if line.startswith("identity  ")][1:]
+    cells = [float(cell) for cell in line.split()[1:]]
+    assert cells[0] == cells[1] == pytest.approx(plain, abs=1e-3)
+    assert cells[4] == pytest.approx(symmetric, abs=1e-3)
+    assert cells[3] == pytest.approx(row.point_distance[1], abs=1e-4)
+    assert "Pairs: 1 plain, 2 symmetric." in text and "forgives such a turn" in text
+    everything = evaluation._replace(symmetric=np.ones(3, bool))
+    assert "Pairs: 3 symmetric." in reports.render(everything)
+
+
 def test_without_overlap_predictions_there_is_one_table():
     assert "overlap prediction" not in reports.render(make_evaluation(ROWS_OF_ALL_KINDS[1]))
 
 
 def test_json_and_csv_hold_the_same_figures(tmp_path):
     evaluated = make_evaluation(*ROWS_OF_ALL_KINDS)
-    reports.write_json(tmp_path / "new folder" / "table.json", evaluated)
-    reports.write_csv(tmp_path / "table.csv", evaluated)
-    content = json.loads((tmp_path / "new folder" / "table.json").read_text())
+    folder = tmp_path / "new folder"
+    reports.save(evaluated, folder)
+    stem = folder / "evaluation_cad-test-noise"
+    content = json.loads(stem.with_suffix(".json").read_text())
     assert (content["pairs_hash"], content["seed"], content["pairs"]) == ("a1b2c3", 7, 3)
     names = [row["method"] for row in content["rows"]]
     assert names == ["ICP", "identity", "network", "untrained", reports.CONSTANT_NAME]
     assert content["rows"][0]["error_rotation_deg"] is None
     assert content["rows"][2]["overlap_f1"] == 0.95
     assert content["rows"][4]["overlap_accuracy"] == 0.76
-    with (tmp_path / "table.csv").open(newline="") as stream:
+    with stem.with_suffix(".csv").open(newline="") as stream:
         lines = list(csv.DictReader(stream))
     for line, row in zip(lines, content["rows"], strict=True):
         assert line["pairs_hash"] == "a1b2c3" and line["command"] == evaluated.command
         assert {name: line[name] for name in row} == {
             name: "" if value is None else str(value) for name, value in row.items()
         }
-    assert {path.name for path in tmp_path.iterdir()} == {"new folder", "table.csv"}
+    assert sorted(folder.iterdir()) == [stem.with_suffix(".csv"), stem.with_suffix(".json")]
 
 
 def test_a_write_that_fails_leaves_the_file_before_it(tmp_path, monkeypatch):

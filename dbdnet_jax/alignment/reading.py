@@ -12,6 +12,8 @@ from typing import Any, BinaryIO
 import numpy as np
 from jaxtyping import Float
 
+from dbdnet_jax.extras import load_open3d
+
 Points = Float[np.ndarray, "n 3"]
 
 MIN_POINTS = 16
@@ -212,13 +214,7 @@ def _read_npz(file: BinaryIO, path: Path, seed: int) -> np.ndarray:
 
 
 def _read_pcd(file: BinaryIO, path: Path, seed: int) -> np.ndarray:
-    try:
-        import open3d
-    except (ImportError, OSError) as error:  # OSError: the wheel is there, a system library is not
-        raise ImportError(
-            f"PCD files need Open3D; importing it failed ({error}). Install it with "
-            '`pip install "dbdnet_jax[baselines]"`, or convert the file to PLY.'
-        ) from error
+    open3d = load_open3d("a PCD file")
     with open3d.utility.VerbosityContextManager(open3d.utility.VerbosityLevel.Error):
         points = np.asarray(open3d.io.read_point_cloud(path).points)
     if not len(points):

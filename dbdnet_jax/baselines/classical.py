@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from dbdnet_jax.extras import load_open3d
 from dbdnet_jax.types import Rigid
 
 Points = Float[np.ndarray, "n 3"]
@@ -28,10 +29,6 @@ FGR_DISTANCE_ESTIMATED = 0.05  # estimated normals are rougher
 NORMAL_NEIGHBOURS = 30
 
 
-class MissingBaselineError(ImportError):
-    """A baseline's library is not installed; the text says what to install."""
-
-
 def identity(source: Points, target: OtherPoints) -> Rigid:
     """No motion: what every method has to beat."""
     return _rigid(np.eye(4))
@@ -41,7 +38,7 @@ def icp(source: Points, target: OtherPoints) -> Rigid:
     """Point-to-point ICP from the identity (Besl & McKay 1992).
 
     Raises:
-        MissingBaselineError: Open3D is absent.
+        MissingExtraError: Open3D is absent.
     """
     return _icp(source, target, np.eye(4), ICP_DISTANCE)
 
@@ -50,7 +47,7 @@ def icp_centred(source: Points, target: OtherPoints) -> Rigid:
     """Point-to-point ICP after the centroids were aligned.
 
     Raises:
-        MissingBaselineError: Open3D is absent.
+        MissingExtraError: Open3D is absent.
     """
     start = np.eye(4)
     start[:3, 3] = target.mean(0, dtype=np.float64) - source.mean(0, dtype=np.float64)
@@ -65,9 +62,9 @@ def fgr(
     The same answer every time: Open3D's random generator is set first.
 
     Raises:
-        MissingBaselineError: Open3D is absent.
+        MissingExtraError: Open3D is absent.
     """
-    o3d = _open3d()
+    o3d = load_open3d("a classical baseline")
     clouds = (_cloud(o3d, source), _cloud(o3d, target))
     for cloud, normals in zip(clouds, (source_normals, target_normals), strict=True):
         cloud.normals = o3d.utility.Vector3dVector(np.asarray(normals, np.float64))
@@ -78,9 +75,9 @@ def fgr_estimated(source: Points, target: OtherPoints) -> Rigid:
     """Fast global registration on FPFH features of normals estimated from the points.
 
     Raises:
-        MissingBaselineError: Open3D is absent.
+        MissingExtraError: Open3D is absent.
     """
-    o3d = _open3d()
+    o3d = load_open3d("a classical baseline")
     clouds = (_cloud(o3d, source), _cloud(o3d, target))
     for cloud in clouds:
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(NORMAL_NEIGHBOURS))
@@ -90,7 +87,7 @@ def fgr_estimated(source: Points, target: OtherPoints) -> Rigid:
 def _icp(
     source: Points, target: OtherPoints, start: Float[np.ndarray, "4 4"], distance: float
 ) -> Rigid:
-    o3d = _open3d()
+    o3d = load_open3d("a classical baseline")
     pipeline = o3d.pipelines.registration
     result = pipeline.registration_icp(
         _cloud(o3d, source),
@@ -119,18 +116,6 @@ def _fgr(o3d: ModuleType, source: Any, target: Any, distance: float) -> Rigid:
         ),
     )
     return _rigid(result.transformation)
-
-
-def _open3d() -> ModuleType:
-    try:
-        import open3d
-    except (ImportError, OSError) as error:  # OSError: the wheel is there, a system library is not
-        raise MissingBaselineError(
-            f"ICP and FGR need Open3D; importing it failed ({error}). Install it with "
-            '`pip install "dbdnet_jax[baselines]"`; on Debian also '
-            "`apt-get install libusb-1.0-0 libgl1`."
-        ) from error
-    return open3d
 
 
 def _cloud(o3d: ModuleType, points: Points) -> Any:

@@ -2,7 +2,6 @@
 
 import hashlib
 import io
-import os
 from pathlib import Path
 
 import jax
@@ -12,6 +11,7 @@ import numpy as np
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.pairs import Protocol, Recipe, assemble, draw_recipe
 from dbdnet_jax.data.shapes import Shapes
+from dbdnet_jax.files import write_whole
 from dbdnet_jax.types import Pair, Rigid
 
 NOISE_UNIT = 2.0**-15  # of the stored integers: 3e-5 of a radius, far below any noise of interest
@@ -54,10 +54,7 @@ def freeze(path: str | Path, shapes: Shapes, protocol: Protocol, *, seed: int, c
         overlap_radius=np.float64(protocol.overlap_radius),
         points_sha256=np.str_(points_hash(shapes)),
     )
-    path = Path(path)
-    part = path.with_name(path.name + ".part")
-    part.write_bytes(buffer.getvalue())
-    os.replace(part, path)
+    write_whole(Path(path), buffer.getvalue())
     return hashlib.sha256(buffer.getvalue()).hexdigest()
 
 

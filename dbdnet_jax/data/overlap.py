@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import threading
+import io
 import zipfile
 import zlib
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+
+from dbdnet_jax.files import write_whole
 
 
 def nearest_within(
@@ -53,10 +54,7 @@ def overlap_labels(
         pass  # not there yet, or damaged
     near_source, near_target = overlap_labels(source, target, radius)
     file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_suffix(f".{os.getpid()}-{threading.get_ident()}.part")
-    with part.open("wb") as stream:
-        np.savez_compressed(
-            stream, source=np.packbits(near_source), target=np.packbits(near_target)
-        )
-    part.replace(file)  # in one step: another reader sees the whole file or none
+    labels = io.BytesIO()
+    np.savez_compressed(labels, source=np.packbits(near_source), target=np.packbits(near_target))
+    write_whole(file, labels.getbuffer())
     return near_source, near_target

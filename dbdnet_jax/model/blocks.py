@@ -4,6 +4,7 @@ Every layer works on one cloud of static size whose valid rows are given by a ma
 cast to the features' type, so a network given float64 computes in float64 throughout.
 """
 
+import operator
 from typing import Any
 
 import flax.linen as nn
@@ -184,9 +185,9 @@ class AttentionBlock(nn.Module):
 
 def over_clouds(module: nn.Module, *stacked: Any) -> Array:
     """Apply a module to both clouds of stacked arguments: one set of weights, compiled once."""
-
-    def one(module, carry, arguments):
-        return carry, module(*arguments)
-
-    both = nn.scan(one, variable_broadcast="params", split_rngs={"params": False})
-    return both(module, (), stacked)[1]
+    if module.is_initializing():
+        clouds = (jax.tree.map(operator.itemgetter(c), stacked) for c in (0, 1))
+        return jnp.stack([module(*cloud) for cloud in clouds])
+    # `nn.scan` would do both, but traces a module twice to find what a scan cannot change.
+    module, variables = module.unbind()
+    return jax.lax.map(lambda arguments: module.apply(variables, *arguments), stacked)

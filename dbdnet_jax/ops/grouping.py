@@ -100,11 +100,32 @@ def _max_bwd(residual, cotangent):
 max_over_slots.defvjp(_max_fwd, _max_bwd)
 
 
+@jax.custom_vjp
 def masked_max(features: Float[Array, "n c"], valid: Bool[Array, " n"]) -> Float[Array, " c"]:
-    """Channel-wise maximum over the valid rows; zeros where no row is valid."""
+    """Channel-wise maximum over the valid rows; zeros where no row is valid.
+
+    Its derivative goes to the first of equal rows, chosen by index. That of `jnp.max` looks for
+    entries equal to the maximum, and loses its way where the compiler computes the features twice
+    and rounds them differently.
+    """
     lowest = jnp.finfo(features.dtype).min
-    # By index: the derivative of `jnp.max` looks for entries equal to the maximum, and loses its
-    # way where the compiler computes the features twice and rounds them differently.
+    best = jnp.max(jnp.where(valid[:, None], features, lowest), axis=0)
+    return jnp.where(jnp.any(valid), best, 0.0)
+
+
+def _masked_fwd(features, valid):
+    lowest = jnp.finfo(features.dtype).min
+    # Only where a derivative is asked for: a CPU takes 4 to 12 times as long as for `jnp.max`.
     row = jnp.argmax(jnp.where(valid[:, None], features, lowest), axis=0)
     best = jnp.take_along_axis(features, row[None, :], axis=0)[0]
-    return jnp.where(jnp.any(valid), best, 0.0)
+    return jnp.where(jnp.any(valid), best, 0.0), (row, valid)
+
+
+def _masked_bwd(residual, cotangent):
+    row, valid = residual
+    rows = jnp.arange(valid.shape[0])
+    chosen = (rows[:, None] == row[None, :]) & jnp.any(valid)
+    return jnp.where(chosen, cotangent[None, :], 0.0), None
+
+
+masked_max.defvjp(_masked_fwd, _masked_bwd)

@@ -26,30 +26,32 @@ def farthest_order(
 ) -> Int[Array, " n"]:
     """A row order whose first rows are farthest-point samples from row 0.
 
-    As many as ``count // 2``, and ``size`` where that is more and there are as many. Each next row
-    is the valid point farthest from all rows before it (Gonzalez 1985; the lower row on ties). The
-    other valid rows follow in their given order, then the padding. The sampling is greedy, so the
-    first rows of the reordered cloud are farthest-point samples of any longer prefix too: in this
-    order every level of a pyramid is a prefix. Clouds of fewer than four points keep their order.
+    As many as ``size``, or ``count // 2`` where it is 0. Each next row is the valid point farthest
+    from all rows before it (Gonzalez 1985; the lower row on ties). The other valid rows follow in
+    their given order, then the padding. The sampling is greedy, so the first rows of the reordered
+    cloud are farthest-point samples of any longer prefix too: in this order every level of a
+    pyramid is a prefix. Clouds of fewer than four points keep their order.
     """
     n = points.shape[0]
     rows = jnp.arange(n)
-    sampled = jnp.maximum(count // 2, jnp.minimum(count, size))
+    sampled = jnp.minimum(count, size) if size else count // 2
     # Padding starts below every distance, so that it is never the farthest.
     start = jnp.where(rows < count, jnp.inf, -1.0).astype(points.dtype)
+    # One array for each coordinate, and two plain reductions where `jnp.argmax` would do: a CPU
+    # takes several elements at a time through these, and a loop of so many steps is all of it.
+    x, y, z = points.T
 
-    def step(i, carry):
-        distance, last, rank = carry
-        rank = rank.at[last].set(jnp.where(i < sampled, i, rank[last]))
-        offset = points - points[last][None, :]
-        offset = jnp.sum(offset * offset, axis=-1)
+    def step(distance, _):
+        last = jnp.min(jnp.where(distance == jnp.max(distance), rows, n - 1))
+        dx, dy, dz = x - x[last], y - y[last], z - z[last]
+        nearer = jnp.minimum(distance, dx * dx + dy * dy + dz * dz)
         # A row once taken must not be taken again, even among duplicates at distance zero.
-        distance = jnp.minimum(distance, offset).at[last].set(-1.0)
-        return distance, jnp.argmax(distance), rank
+        return jnp.where(rows == last, -1.0, nearer), last
 
+    _, taken = jax.lax.scan(step, start, length=min(n, size) or n // 2)
+    place = jnp.arange(taken.shape[0])
     rank = jnp.where(rows < count, n + rows, 2 * n + rows)
-    first = jnp.zeros((), rows.dtype)
-    _, _, rank = jax.lax.fori_loop(0, max(n // 2, min(n, size)), step, (start, first, rank))
+    rank = rank.at[jnp.where(place < sampled, taken, n)].set(place, mode="drop")
     return jnp.argsort(rank)
 
 

@@ -5,11 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dbdnet_jax.model import edgeconv
 from dbdnet_jax.model.edgeconv import EdgeConv, edge_extremes, edge_moments
 from dbdnet_jax.ops.grouping import knn
 from dbdnet_jax.ops.sampling import prefix_mask
 from tests import oracle
-from tests.conftest import Tolerance, assert_close, assert_finite, random_cloud
+from tests.conftest import FLOAT64, Tolerance, assert_close, assert_finite, random_cloud
 from tests.model.small import assert_same_derivative, cast
 
 N, K, WIDTH, GROUPS = 24, 5, 8, 4
@@ -93,6 +94,19 @@ def test_statistics_keep_their_digits_far_from_the_origin():
     assert_close(extreme, np.where(rising, edges.max(1), edges.min(1)), OFFSET)
     assert_close(mean, edges[:150].mean((0, 1)), OFFSET)
     assert_close(variance, edges[:150].var((0, 1)), OFFSET)
+
+
+def test_rows_in_several_blocks_give_what_one_block_does(monkeypatch, x64):
+    layers, x = cast(LAYERS, np.float64), jnp.asarray(random_cloud(11, N))
+
+    def total(x):
+        return jnp.sum(jnp.sin(edge_conv_eagerly(x, N - 2, *layers)[: N - 2]))
+
+    one = jax.jit(jax.value_and_grad(total))(x)
+    monkeypatch.setattr(edgeconv, "BLOCK_VALUES", 5 * K * WIDTH)  # five rows, the last block four
+    several = jax.jit(jax.value_and_grad(lambda x: total(x)))(x)
+    for found, expected in zip(several, one, strict=True):
+        assert_close(found, expected, FLOAT64)
 
 
 def test_edge_conv_of_degenerate_clouds_is_finite(degenerate):

@@ -209,11 +209,32 @@ def test_repeating_the_nearest_neighbour_does_not_change_the_maximum():
     assert_close(many, few, EXACT)
 
 
+def test_the_maximum_over_slots_is_numpys_and_its_derivative_goes_to_the_first(x64):
+    values = random_cloud(35, 24).reshape(4, 6, 3)
+    assert_close(grouping.max_over_slots(jnp.asarray(values)), values.max(axis=0), EXACT)
+    check_gradients(lambda x: jnp.sum(jnp.sin(grouping.max_over_slots(x))), values)
+    tied = np.zeros((4, 6, 3))
+    tied[1:] = 1.0
+    gradient = jax.grad(lambda x: jnp.sum(grouping.max_over_slots(x)))(jnp.asarray(tied))
+    assert_close(gradient, np.where(np.arange(4)[:, None, None] == 1, tied, 0.0), EXACT)
+
+
 def test_a_masked_maximum_sees_valid_rows_only(x64):
     features = random_cloud(31, 20, 4) - 5.0  # all negative: zero would show
     valid = np.random.default_rng(3).random(20) < 0.5
     spoilt = np.where(valid[:, None], features, 1e6)
     assert_close(masked_max(spoilt, valid), features[valid].max(axis=0), EXACT)
+
+
+def test_the_derivative_of_a_masked_maximum_goes_to_the_largest_valid_row(x64):
+    features, valid = random_cloud(36, 20, 4), np.arange(20) % 3 > 0
+    spoilt = np.where(valid[:, None], features, 1e3)
+    check_gradients(lambda f: jnp.sum(jnp.sin(grouping.masked_max(f, jnp.asarray(valid)))), spoilt)
+    value, gradient = jax.value_and_grad(
+        lambda f: jnp.sum(grouping.masked_max(f, jnp.asarray(valid)))
+    )(jnp.asarray(spoilt))
+    assert_close(value, np.sum(features[valid].max(axis=0)), FLOAT64)
+    assert_close(gradient, (features == features[valid].max(axis=0)) * 1.0, EXACT)
 
 
 def test_a_masked_maximum_of_nothing_is_zero_with_no_gradient():

@@ -1,0 +1,1 @@
+"""Reports that people look at: pages of interactive figures, and pictures."""

@@ -1,0 +1,67 @@
+"""Clouds of any size go through a few compiled programs."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dbdnet_jax import programs
+from dbdnet_jax.alignment import search
+from dbdnet_jax.polish import Polished
+from dbdnet_jax.types import Branch, Registration, Rigid
+from tests.aligning import tiny_params
+from tests.conftest import random_cloud
+
+BUCKETS = {192, 384, 768, 1536}
+
+
+def answer_nothing(params, src, tgt, src_mask, tgt_mask) -> Registration:
+    """A stand-in for `register`: the right shapes, at no cost."""
+    n, m = len(src), len(tgt)
+    branch = Branch(jnp.zeros((n, m)), jnp.zeros((n, 3)), jnp.zeros(n))
+    return Registration(
+        rotation=jnp.eye(3),
+        translation=jnp.zeros(3),
+        src_overlap=src_mask * 1.0,
+        tgt_overlap=tgt_mask * 1.0,
+        src_kept=src_mask,
+        tgt_kept=tgt_mask,
+        rotation_branch=branch,
+        translation_branch=branch,
+        confidence=jnp.zeros(n),
+        valid=jnp.any(src_mask),
+    )
+
+
+def test_every_file_that_a_kept_program_comes_of_is_there():
+    package = Path(programs.__file__).parent
+    assert all(any(package.glob(name)) for name in programs.TRACED)
+
+
+def test_fifty_sizes_are_traced_as_often_as_there_are_buckets(monkeypatch):
+    networks, polishes = [], []
+
+    def register(params, src, tgt, *masks):
+        networks.append((len(src), len(tgt)))
+        return answer_nothing(params, src, tgt, *masks)
+
+    @jax.jit
+    def polish(source, target, start):
+        polishes.append((len(source.points), len(target.points)))
+        return Polished(Rigid(*start), jnp.zeros(()), jnp.ones((), bool))
+
+    monkeypatch.setattr(search, "register", register)
+    monkeypatch.setattr(search, "polish", polish)
+    monkeypatch.setattr(search, "_PROGRAMS", {})
+    # Not through files: the stand-in must not be kept as the network's program.
+    monkeypatch.setattr(search, "load_or_trace", lambda function, *rest: jax.jit(function))
+    for n, m in np.random.default_rng(0).integers(16, max(BUCKETS) + 1, (50, 2)):
+        source, target = random_cloud(n, n), random_cloud(m, m)
+        proposal = search.ask_network(tiny_params(), source, target)
+        assert proposal.mass.shape == (n, m)
+        assert proposal.source_kept.all() and proposal.target_overlap.all()
+        search.refine(proposal.transform, source, target)
+    for traces in (networks, polishes):
+        assert len(traces) == len(set(traces)) <= len(BUCKETS)
+        assert {size for pair in traces for size in pair} <= BUCKETS

@@ -1,0 +1,74 @@
+"""Put trained weights into the package, with what they are and what they score.
+
+    python -m tools.ship_weights runs/cad --pairs 32100 32100
+    python -m tools.ship_weights runs/overlap runs/registration --pairs 104576 39260
+
+Takes the overlap network of the first run and the registration network of the last, scores them on
+the validation pairs and on the frozen test pairs of configs/cad.py, and writes
+dbdnet_jax/pretrained/NAME.npz. Fit the success probability anew afterwards:
+`python -m tools.fit_success`.
+"""
+
+import argparse
+import dataclasses
+import json
+import subprocess
+from pathlib import Path
+
+import jax
+
+from configs import cad
+from dbdnet_jax.checkpoint import STAGES, load_best
+from dbdnet_jax.data.frozen import CAD_VARIANTS, cad_test_pairs
+from dbdnet_jax.evaluation import evaluate_method, from_network
+from dbdnet_jax.model.params import Params
+from dbdnet_jax.settings import read_settings
+from dbdnet_jax.sources import load_source
+from dbdnet_jax.types import Pair
+from dbdnet_jax.weights import PRETRAINED, load_params, save_params
+
+
+def main() -> None:
+    """Read the arguments, merge, score and write."""
+    parser = argparse.ArgumentParser("ship_weights")
+    parser.add_argument("runs", nargs="+", type=Path, help="run folders or .npz files: one or two")
+    parser.add_argument("--name", default="cad")
+    parser.add_argument("--pairs", nargs=2, type=int, required=True, help="seen by each network")
+    parser.add_argument("--note", default="", help="anything else that people should know")
+    options = parser.parse_args()
+    overlap, registration = (_load(path) for path in (options.runs[0], options.runs[-1]))
+    settings = read_settings(cad.get_config())
+    params = Params(overlap.overlap, registration.registration, settings.model)
+    metadata = {
+        "data": "embedded CAD shapes, training split, and procedural shapes; configs/cad.py",
+        "protocol": dataclasses.asdict(settings.protocol),
+        "pairs_seen": dict(zip(STAGES, options.pairs, strict=True)),
+        "note": options.note,
+        "commit": subprocess.check_output(["git", "rev-parse", "HEAD"], text=True).strip(),
+        "validation": _figures(params, jax.device_get(load_source(settings, 1).validation)),
+        "test": {
+            variant: {"sha256": digest, **_figures(params, pairs)}
+            for variant in CAD_VARIANTS
+            if variant != "unseen"
+            for pairs, digest in [cad_test_pairs(variant)]
+        },
+    }
+    save_params(PRETRAINED / f"{options.name}.npz", params, metadata=metadata)
+    print(json.dumps(metadata, indent=2))
+
+
+def _load(path: Path) -> Params:
+    return load_params(path) if path.suffix == ".npz" else load_best(path)
+
+
+def _figures(params: Params, pairs: Pair) -> dict:
+    """The network's row over stacked pairs, without the time."""
+    summary = evaluate_method("DBDNet", from_network(params), pairs).summary
+    assert summary is not None and summary.overlap is not None
+    overlap = {f"overlap_{name}": round(x, 4) for name, x in summary.overlap._asdict().items()}
+    motion = {name: round(x, 4) for name, x in summary._asdict().items() if name != "overlap"}
+    return motion | overlap
+
+
+if __name__ == "__main__":
+    main()
