@@ -28,7 +28,7 @@ from dbdnet_jax.programs import keep_compiled_programs
 from dbdnet_jax.report import render, save
 from dbdnet_jax.settings import Settings, parse_flags, read_settings
 from dbdnet_jax.sweep import SWEEP_PAIRS, SWEEPS, render_sweep, save_sweep, sweep
-from dbdnet_jax.weights import PRETRAINED, load_params, load_pretrained
+from dbdnet_jax.weights import PRETRAINED, load_named
 
 CONFIG = config_flags.DEFINE_config_file("config", None, "Configuration file, configs/NAME.py.")
 RUN_DIR = flags.DEFINE_string("run_dir", None, "The run to score; runs/NAME if not given.")
@@ -41,33 +41,40 @@ SWEEP = flags.DEFINE_multi_enum(
 REPORT = flags.DEFINE_bool("report", False, "Draw a page too, with the sweeps saved in RUN_DIR.")
 
 
-def choose_params(params: str | None, run_dir: Path, config_name: str) -> Params:
-    """The weights asked for: a file, or a name of weights in the package.
+def choose_params(params: str | None, run_dir: str | None, config_name: str) -> Params:
+    """The weights asked for: a file, or a name of weights in the package, or a run's best.
 
-    Without either the run's best or, where nothing was trained, the package's for the
-    configuration of the same name.
+    Without any of them the best of runs/NAME or, where nothing was trained, the package's for the
+    configuration of that name.
     """
-    if params is None:
-        trained = any((run_dir / stage / "checkpoints").is_dir() for stage in STAGES)
-        if trained or not (PRETRAINED / f"{config_name}.npz").is_file():
-            return load_best(run_dir)
-        print(f"{run_dir} holds no training; scoring the weights in the package.", file=sys.stderr)
-        params = config_name
-    return load_params(params) if params.endswith(".npz") else load_pretrained(params)
+    if params is not None:
+        return load_named(params)
+    default = Path("runs") / config_name
+    trained = any((default / stage / "checkpoints").is_dir() for stage in STAGES)
+    if run_dir is not None or trained or not (PRETRAINED / f"{config_name}.npz").is_file():
+        return load_best(run_dir or default)
+    print(f"{default} holds no training; scoring the weights in the package.", file=sys.stderr)
+    return load_named(config_name)
 
 
 def run_sweeps(settings: Settings, params: Params, run_dir: Path) -> None:
     """Print and write one table for each sweep asked for."""
     for name in SWEEP.value or ():
         points = list(sweep(name, settings, params, run_dir, COUNT.value or SWEEP_PAIRS))
-        print(render_sweep(name, points), end="\n\n")
-        save_sweep(name, points, run_dir)
+        command = shlex.join(["python", *sys.argv])
+        print(render_sweep(name, points, command), end="\n\n")
+        save_sweep(name, points, run_dir, command)
 
 
 def main(argv: list[str]) -> None:
     """Choose the weights, score them, print and write the table."""
     if argv[1:]:
         raise app.UsageError(f"arguments must be flags such as --params=cad; got {argv[1:]}.")
+    if SWEEP.value and (REPORT.value or BENCHMARK.value != "3DMatch"):
+        raise app.UsageError(
+            "--sweep goes without --report and --benchmark; a later call with --report alone draws "
+            "the sweeps that were saved."
+        )
     logging.set_verbosity(logging.WARNING)
     keep_compiled_programs()
     config_name = Path(config_flags.get_config_filename(flags.FLAGS["config"])).stem
@@ -76,7 +83,7 @@ def main(argv: list[str]) -> None:
         if REPORT.value:
             require_drawing()
         settings = read_settings(CONFIG.value)
-        params = choose_params(PARAMS.value, run_dir, config_name)
+        params = choose_params(PARAMS.value, RUN_DIR.value, config_name)
         if SWEEP.value:
             return run_sweeps(settings, params, run_dir)
         evaluation = evaluate(

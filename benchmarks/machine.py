@@ -4,6 +4,7 @@ import json
 import os
 import platform
 import resource
+import shlex
 import statistics
 import sys
 import time
@@ -14,6 +15,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+
+from dbdnet_jax.files import write_whole
 
 SIZE = 2048  # of the product that measures the machine
 LIBRARIES = ("jax", "jaxlib", "flax", "optax", "numpy")
@@ -77,7 +80,7 @@ def peak_gib() -> float:
 def record(module: str, figures: dict[str, Any]) -> dict[str, Any]:
     """Figures with what they were measured on and by which command."""
     return {
-        "command": " ".join([f"python -m {module}", *sys.argv[1:]]),
+        "command": shlex.join(["python", "-m", module, *sys.argv[1:]]),
         "date": time.strftime("%Y-%m-%d"),
         "python": platform.python_version(),
         "versions": {library: version(library) for library in LIBRARIES},
@@ -96,7 +99,7 @@ def publish(found: dict[str, Any], out: str | None) -> None:
     text = json.dumps(found, indent=1)
     print(text)
     if out:
-        Path(out).write_text(text + "\n")
+        write_whole(Path(out), (text + "\n").encode())
 
 
 def processor() -> str:

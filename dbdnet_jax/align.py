@@ -86,7 +86,7 @@ def align(
       source: (n, 3) numbers, n >= 16, or a file; see `reading.read_points`.
       target: the same, (m, 3), in the same unit.
       params: the network; the weights in the package, if None.
-      refine: polish the network's pose, from it and from near it, on up to 3,072 points of each
+      refine: polish the network's pose, from it and from near it, on up to 1,024 points of each
         cloud.
       scale: factor from the clouds' unit to the weights'; "auto" brings the larger cloud to the
         size of a partial scan of a shape in the unit sphere.

@@ -176,8 +176,11 @@ def _edge(
     """What became of an alignment."""
     if constraint is None:
         return Edge(*pair, alignment, False, alignment.reason, np.nan, np.nan)
-    if pair[0] not in poses or pair[1] not in poses:
-        return Edge(*pair, alignment, False, "leads to no cloud with a pose", np.nan, np.nan)
+    placed = sum(cloud in poses for cloud in pair)
+    if placed < 2:
+        alone = "the others contradict it, and no other alignment joins its clouds"
+        reason = alone if placed else "leads to no cloud with a pose"
+        return Edge(*pair, alignment, False, reason, np.nan, np.nan)
     share, degrees = disagreement(constraint, poses)
     residual = share * alignment.inlier_distance
     reason = f"the others contradict it: off by {degrees:.1f} degrees and {residual:.3g}"
@@ -206,12 +209,14 @@ def _check_pairs(count: int, pairs: Sequence[tuple[int, int]] | None) -> Sequenc
                 f"{len(every)} pairs. Name those that overlap: pairs=[(0, 1), (1, 2), ...]."
             )
         return every
-    for i, j in pairs:
-        if i == j or not (0 <= i < count and 0 <= j < count) or list(pairs).count((i, j)) > 1:
+    chosen = [(int(i), int(j)) for i, j in pairs]
+    for i, j in chosen:
+        if i == j or not (0 <= i < count and 0 <= j < count) or chosen.count((i, j)) > 1:
             raise ValueError(
-                f"pairs must be different and of two clouds in 0..{count - 1}; got ({i}, {j})."
+                f"pairs must be different and of two clouds in 0..{count - 1}; got ({i}, {j}). "
+                "Name each pair once, clouds counted from 0."
             )
-    return pairs
+    return chosen
 
 
 def _check_initial(initial: Any, count: int) -> Float[np.ndarray, "k 4 4"]:
@@ -219,6 +224,6 @@ def _check_initial(initial: Any, count: int) -> Float[np.ndarray, "k 4 4"]:
     if guesses.shape != (count, 4, 4) or not np.isfinite(guesses).all():
         raise ValueError(
             f"initial must hold a finite 4x4 pose for each of the {count} clouds; got shape "
-            f"{guesses.shape}."
+            f"{guesses.shape}. Stack one for each cloud, the identity where nothing is known."
         )
     return guesses

@@ -1,7 +1,9 @@
 """``dbdnet-register``: `align` for the command line."""
 
 import argparse
+import glob
 import io
+import math
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
@@ -106,12 +108,11 @@ def _settings(options: argparse.Namespace) -> dict:
     """Arguments of `align` that all pairs share; imports what takes time to import."""
     from dbdnet_jax.alignment.reading import read_transform
     from dbdnet_jax.programs import keep_compiled_programs
-    from dbdnet_jax.weights import load_params, load_pretrained
+    from dbdnet_jax.weights import load_named
 
     keep_compiled_programs()
-    name = options.params
     return {
-        "params": load_params(name) if name.endswith(".npz") else load_pretrained(name),
+        "params": load_named(options.params),
         "refine": options.refine,
         "initial": None if options.initial is None else read_transform(options.initial),
         "scale": options.scale,
@@ -161,10 +162,14 @@ def _pairs(batch: Path) -> Iterator[tuple[str, Path, Path]]:
     if batch.is_dir():
         for source in sorted(batch.glob("*_source.*")):
             name = source.stem.removesuffix("_source")
-            targets = sorted(batch.glob(f"{name}_target.*"))
-            if len(targets) != 1:
-                raise ValueError(f"{source} must have one {name}_target.*; got {len(targets)}.")
-            yield name, source, targets[0]
+            same = glob.escape(name)
+            counts = [len(list(batch.glob(f"{same}_{kind}.*"))) for kind in ("source", "target")]
+            if counts != [1, 1]:
+                raise ValueError(
+                    f"{batch} must hold one {name}_source.* and one {name}_target.*; got "
+                    f"{counts[0]} and {counts[1]}. Rename or remove the others."
+                )
+            yield name, source, next(batch.glob(f"{same}_target.*"))
         return
     lines = batch.read_text(errors="surrogateescape").splitlines()
     for number, line in enumerate(lines, 1):
@@ -227,6 +232,8 @@ def summary(source: Path, target: Path, alignment: "Alignment") -> str:
     """An alignment in a few lines."""
     from scipy.spatial.transform import Rotation
 
+    from dbdnet_jax.alignment.success import SUCCESS_DEG
+
     turn = Rotation.from_matrix(alignment.rotation).magnitude()
     rows = [" ".join(f"{x:16.9g}" for x in row) for row in alignment.transform]
     verdict = "aligned" if alignment.valid else f"NOT ALIGNED with confidence: {alignment.reason}"
@@ -235,10 +242,11 @@ def summary(source: Path, target: Path, alignment: "Alignment") -> str:
         [
             f"{target} ~ T {source}, T =",
             *rows,
-            f"rotation     {180 / 3.141592653589793 * turn:.3f} degrees",
+            f"rotation     {math.degrees(turn):.3f} degrees",
             f"inliers      {alignment.inlier_ratio:.1%} of the source within "
             f"{alignment.inlier_distance:.3g} of the target, RMSE {alignment.rmse:.3g}",
-            f"probability  {alignment.success_probability:.3f} that the rotation is right to 5 deg",
+            f"probability  {alignment.success_probability:.3f} that the rotation is right to "
+            f"{SUCCESS_DEG:g} deg",
             *(f"warning      {warning}" for warning in alignment.warnings),
             f"time         {sum(alignment.timings.values()):.2f} s ({laps})",
             verdict,

@@ -1,5 +1,6 @@
 """Every method on the same test pairs, one pair at a time: errors and wall time."""
 
+import dataclasses
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -39,6 +40,7 @@ from dbdnet_jax.recall import ScanRecall, Scans, correspondence_rmse_m, scan_rec
 from dbdnet_jax.settings import Settings
 from dbdnet_jax.types import Pair, Registration, Rigid
 
+TRUE_NORMALS = "FGR, true normals"
 Method = Callable[[Pair], Rigid | Registration]
 
 
@@ -103,12 +105,10 @@ def evaluate(
         scans = scans and scans.first(count)
         symmetric = symmetric if symmetric is None else symmetric[:count]
     methods = make_methods(params, settings.train.seed)
-    if not pairs.source_normals.any():  # scans come without
-        del methods["FGR, true normals"]
     if scans is not None:  # the lengths of `polish` are those of a shape in the unit sphere
         methods.pop("DBDNet, polished", None)
     return Evaluation(
-        rows=evaluate_methods(methods, pairs, scans),
+        rows=evaluate_methods(possible(methods, pairs), pairs, scans),
         constant_overlap=constant_overlap(pairs),
         pair_set=name,
         pairs=len(pairs.source.count),
@@ -134,7 +134,7 @@ def make_methods(params: Params, seed: int) -> dict[str, Method]:
         "identity": from_points(identity),
         "ICP": from_points(icp),
         "ICP, centroids first": from_points(icp_centred),
-        "FGR, true normals": from_normals(fgr),
+        TRUE_NORMALS: from_normals(fgr),
         "FGR, estimated normals": from_points(fgr_estimated),
         f"{name} (untrained)": network(untrained),
         name: network(params),
@@ -142,6 +142,13 @@ def make_methods(params: Params, seed: int) -> dict[str, Method]:
     if params.overlap is not None:
         methods["DBDNet, polished"] = from_polished_network(params)
     return methods
+
+
+def possible(methods: Mapping[str, Method], pairs: Pair) -> dict[str, Method]:
+    """The methods without those that need normals, where the pairs, as of scans, have none."""
+    if pairs.source_normals.any():
+        return dict(methods)
+    return {name: method for name, method in methods.items() if name != TRUE_NORMALS}
 
 
 def from_points(baseline: Callable[..., Rigid]) -> Method:
@@ -185,8 +192,10 @@ def from_polished_network(params: Params) -> Method:
 def from_true_overlap(params: Params) -> Method:
     """The registration network behind the true overlap labels: a bound, since it is told them.
 
-    Its row has no overlap figures.
+    It solves as often as `register` does. Its row has no overlap figures.
     """
+    config = dataclasses.replace(params.config, iterations=params.config.solves)
+    params = Params(params.overlap, params.registration, config)
     compiled = jax.jit(_register_given_labels)
     return lambda pair: compiled(params, pair)
 

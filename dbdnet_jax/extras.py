@@ -20,7 +20,7 @@ def load_open3d(needed_by: str) -> ModuleType:
         raise MissingExtraError(
             f"{needed_by} needs Open3D; importing it failed ({error}). Install it with "
             '`pip install "dbdnet_jax[baselines]"`; on Debian also '
-            "`apt-get install libusb-1.0-0 libgl1`."
+            "`apt-get install libusb-1.0-0 libgl1 libgomp1`."
         ) from error
     return open3d
 

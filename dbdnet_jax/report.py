@@ -116,7 +116,7 @@ class Table(NamedTuple):
 
 
 def tables(evaluation: Evaluation) -> list[Table]:
-    """Errors of the motion; then, where there are any, registration recall and overlap."""
+    """Errors of the motion; then, where there are any, recall, symmetric shapes apart, overlap."""
     rows = evaluation.rows
     notes = [DEFINITIONS, *_remarks(rows)]
     found = [_of_columns("Errors", "method", MOTION_COLUMNS, rows, notes)]
@@ -271,8 +271,13 @@ def _flat(row: Row) -> dict[str, Any]:
         | summary
         | _flat_overlap(overlap)
         | recall
+        | {"point_distance": _mean(row.point_distance)}
         | {"seconds_per_pair": row.seconds_per_pair, "note": row.note}
     )
+
+
+def _mean(values: np.ndarray | None) -> float | None:
+    return None if values is None else float(values.mean())
 
 
 def _flat_overlap(overlap: OverlapSummary | None) -> dict[str, Any]:

@@ -170,7 +170,9 @@ def _registration_functions(settings: Settings) -> tuple[LossFunction, Validatio
         if stage.masks == "predicted":
             found = register_clouds(Params(frozen, trainable, model), pair.source, pair.target)
         else:
-            found = answer(trainable, pair, (pair.source_overlap, pair.target_overlap))
+            as_often = dataclasses.replace(model, iterations=model.solves)
+            truth = pair.source_overlap, pair.target_overlap
+            found = answer(trainable, pair, truth, model=as_often)
         errors = registration_errors(found, pair)
         return {
             "error": errors.rotation_deg,

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 
 from dbdnet_jax.data.pairs import Protocol
-from dbdnet_jax.evaluation import Row, evaluate_method, make_methods
+from dbdnet_jax.evaluation import Row, evaluate_methods, make_methods, possible
 from dbdnet_jax.files import write_whole
 from dbdnet_jax.model.params import Params
 from dbdnet_jax.pair_sets import load_test_pairs
@@ -47,7 +47,7 @@ SWEEPS = {
         lambda protocol, value: dataclasses.replace(protocol, max_angle_deg=float(value)),
     ),
     "points": Sweep(
-        "points before the crop",
+        "points before the crop, drawn from a shape's 2,048",
         (256, 512, 1024, 2048, 4096),
         lambda protocol, value: dataclasses.replace(protocol, points=int(value)),
     ),
@@ -82,24 +82,29 @@ def sweep(
             "a sweep needs shapes, from which pairs are drawn; config.data.name is 'threedmatch'. "
             "Use configs/cad.py or configs/modelnet.py."
         )
-    methods = make_methods(params, settings.train.seed)
-    for unwanted in [name for name in methods if name == "identity" or "untrained" in name]:
-        del methods[unwanted]
+    methods = {
+        name: method
+        for name, method in make_methods(params, settings.train.seed).items()
+        if name != "identity" and "untrained" not in name
+    }
     for value in SWEEPS[name].values:
         protocol = SWEEPS[name].change(settings.protocol, value)
         changed = dataclasses.replace(settings, protocol=protocol)
         pairs = load_test_pairs(changed, Path(run_dir) / "sweep").pairs
         pairs = jax.tree.map(lambda leaf: leaf[:count], pairs)
-        for method, run in methods.items():
-            yield SweepPoint(value, evaluate_method(method, run, pairs))
+        for row in evaluate_methods(possible(methods, pairs), pairs):
+            yield SweepPoint(value, row)
 
 
-def save_sweep(name: str, points: list[SweepPoint], run_dir: str | Path) -> Path:
-    """Write RUN_DIR/sweep_NAME.csv, one line for each method and value; returns its path."""
+def save_sweep(name: str, points: list[SweepPoint], run_dir: str | Path, command: str) -> Path:
+    """Write RUN_DIR/sweep_NAME.csv, one line for each method and value; returns its path.
+
+    ``command`` is what to show as the way to get here; it stands on every line.
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     head = ("vary", "value", "method", "error_r", "error_t", "median_r", "recall", "seconds")
-    writer.writerow(head)
+    writer.writerow([*head, "pairs", "command"])
     for value, row in points:
         if row.summary is not None:
             figures = (
@@ -109,20 +114,30 @@ def save_sweep(name: str, points: list[SweepPoint], run_dir: str | Path) -> Path
                 row.summary.recall_5deg_0p1,
                 row.seconds_per_pair,
             )
-            writer.writerow([name, value, row.method, *(f"{figure:.6g}" for figure in figures)])
+            writer.writerow(
+                [
+                    name,
+                    value,
+                    row.method,
+                    *(f"{figure:.6g}" for figure in figures),
+                    row.summary.pairs,
+                    command,
+                ]
+            )
     path = Path(run_dir) / f"sweep_{name}.csv"
+    path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, text.getvalue().encode())
     return path
 
 
-def render_sweep(name: str, points: list[SweepPoint]) -> str:
+def render_sweep(name: str, points: list[SweepPoint], command: str) -> str:
     """A line for each method, its mean and median rotation error in degrees at each value."""
     values = list(dict.fromkeys(point.value for point in points))
-    lines = [f"{SWEEPS[name].label:34s}" + "".join(f"{value:>15g}" for value in values)]
+    lines = [f"{SWEEPS[name].label:50s}" + "".join(f"{value:>15g}" for value in values)]
     for method in dict.fromkeys(point.row.method for point in points):
         cells = [_cell(row) for _, row in points if row.method == method]
-        lines.append(f"{method:34s}" + "".join(f"{cell:>15s}" for cell in cells))
-    lines.append("Error R in degrees: mean / median over the pairs.")
+        lines.append(f"{method:50s}" + "".join(f"{cell:>15s}" for cell in cells))
+    lines += ["Error R in degrees: mean / median over the pairs of each value.", command]
     return "\n".join(lines)
 
 

@@ -116,6 +116,11 @@ def load_pretrained(name: str = "cad") -> Params:
     return load_params(available[name])
 
 
+def load_named(name: str) -> Params:
+    """Weights by the path of a ``.npz`` file, or by their name in the package."""
+    return load_params(name) if name.endswith(".npz") else load_pretrained(name)
+
+
 def _checksum(header: str, arrays: Mapping[str, np.ndarray]) -> str:
     """Hash of the header and of every array's name, type, shape and bytes."""
     digest = hashlib.sha256(header.encode())

@@ -153,7 +153,8 @@ def test_a_broken_link_is_caught(tmp_path, link):
     pytest.importorskip("furo", reason="the docs extra (Sphinx, MyST, furo) is not installed")
     (tmp_path / "conf.py").write_text((ROOT / "docs" / "conf.py").read_text())
     (tmp_path / "index.md").write_text(f"# A\n\n{link}\n")
-    assert "none" in build(tmp_path, tmp_path / "site").stderr
+    run = build(tmp_path, tmp_path / "site")
+    assert "none" in run.stderr and run.returncode != 0
 
 
 def test_the_notebook_runs_and_is_stored_without_output(monkeypatch):

@@ -26,7 +26,7 @@ from dbdnet_jax.data.pairs import Protocol, make_pair
 from dbdnet_jax.files import write_whole
 from dbdnet_jax.model.params import Params
 from dbdnet_jax.types import Pair
-from dbdnet_jax.weights import load_params, load_pretrained
+from dbdnet_jax.weights import load_named
 
 PROTOCOLS = (Protocol(), Protocol(noise_sigma=0.0), Protocol(disjoint=True))
 SEED = 77
@@ -132,8 +132,7 @@ def main() -> None:
     parser.add_argument("--check", action="store_true")
     parser.add_argument("--output", type=Path, default=SUCCESS_FILE)
     options = parser.parse_args()
-    name = options.params
-    params = load_params(name) if name.endswith(".npz") else load_pretrained(name)
+    params = load_named(options.params)
     if options.check:
         evidence, success, _, _ = examine(params, test_pairs(), 200)
         held = load_coefficients(options.output)

@@ -36,15 +36,16 @@ def main() -> None:
     parser.add_argument("--pairs", nargs=2, type=int, required=True, help="seen by each network")
     parser.add_argument("--note", default="", help="anything else that people should know")
     options = parser.parse_args()
+    if len(options.runs) > 2:
+        parser.error(f"give one or two runs; got {len(options.runs)}")
     overlap, registration = (_load(path) for path in (options.runs[0], options.runs[-1]))
     settings = read_settings(cad.get_config())
     params = Params(overlap.overlap, registration.registration, settings.model)
     metadata = {
-        "data": "embedded CAD shapes, training split, and procedural shapes; configs/cad.py",
         "protocol": dataclasses.asdict(settings.protocol),
         "pairs_seen": dict(zip(STAGES, options.pairs, strict=True)),
         "note": options.note,
-        "commit": subprocess.check_output(["git", "rev-parse", "HEAD"], text=True).strip(),
+        "shipped_from": subprocess.check_output(["git", "rev-parse", "HEAD"], text=True).strip(),
         "validation": _figures(params, jax.device_get(load_source(settings, 1).validation)),
         "test": {
             variant: {"sha256": digest, **_figures(params, pairs)}

@@ -19,7 +19,6 @@ main { max-width: 1240px; margin: 0 auto; padding: 24px 16px 48px; }
 h1 { margin: 0; font-size: 1.7rem; line-height: 1.25; overflow-wrap: anywhere; }
 h2 { margin: 0 0 4px; font-size: 1.1rem; }
 p { margin: 0 0 8px; overflow-wrap: anywhere; }
-.lead { color: #52606d; margin-bottom: 16px; }
 .good { border-left: 6px solid #009E73; padding-left: 14px; }
 .bad { border-left: 6px solid #D55E00; padding-left: 14px; }
 .tiles, .grid { display: grid; gap: 16px; margin: 16px 0; }

@@ -62,8 +62,9 @@ class ModelConfig:
                 )
         if self.overlap_passes > 1 and not self.overlap_matching:
             raise ValueError(
-                "overlap_passes must be 1 without overlap_matching, which gives the motion that "
-                f"the next pass starts from; got {self.overlap_passes}. Set overlap_matching=True."
+                "overlap_passes must be 1 without overlap_matching, whose matches give the motion "
+                "between passes while the overlap network is trained alone; got "
+                f"{self.overlap_passes}. Set overlap_matching=True."
             )
         counts = ("overlap_passes", "iterations", "sinkhorn_iterations", "neighbours", "min_points")
         for name in (*counts, "heads"):
@@ -84,6 +85,11 @@ class ModelConfig:
             )
         if not 0.0 <= self.dropout < 1.0:
             raise ValueError(f"dropout must be in [0, 1); got {self.dropout}.")
+
+    @property
+    def solves(self) -> int:
+        """How often `register` solves for the motion."""
+        return self.overlap_passes * self.iterations
 
     @property
     def head_layers(self) -> Layers:

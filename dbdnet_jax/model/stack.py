@@ -39,7 +39,9 @@ def stack_masked(src, tgt, src_mask, tgt_mask) -> tuple[Cloud, Int[Array, "2 n"]
 
 
 def prepare(clouds: Cloud, config: ModelConfig, limit: int):
-    """Centre both clouds and bring them into farthest-point order, ``limit`` rows at least.
+    """Centre both clouds and bring them into farthest-point order.
+
+    ``limit`` rows are sampled; half of the points where it is 0.
 
     Returns the clouds, the order, the released code's rows for query-down, and the centroids.
     What stands in the padding is overwritten, so that it cannot matter from here on.

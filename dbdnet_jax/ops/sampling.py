@@ -30,7 +30,8 @@ def farthest_order(
     from all rows before it (Gonzalez 1985; the lower row on ties). The other valid rows follow in
     their given order, then the padding. The sampling is greedy, so the first rows of the reordered
     cloud are farthest-point samples of any longer prefix too: in this order every level of a
-    pyramid is a prefix. Clouds of fewer than four points keep their order.
+    pyramid is a prefix. Where ``size`` is 0, clouds of fewer than four points keep
+    their order.
     """
     n = points.shape[0]
     rows = jnp.arange(n)
