@@ -108,15 +108,15 @@ def test_the_frozen_overlap_network_gets_no_key_for_dropout(tmp_path, monkeypatc
     (tmp_path / "overlap").mkdir()
     keys = {}
 
-    def predicted(params, source, target, key=None):
+    def predicted(params, source, target, key=None, start=None):
         keys["overlap"] = key
-        return jnp.ones(N), jnp.ones(N)
+        return jnp.ones(N), jnp.ones(N), None
 
     def registered(params, source, target, source_overlap, target_overlap, key=None):
         keys["registration"] = key
 
     monkeypatch.setattr(stages, "load_best", lambda run_dir: Params({}, None, model))
-    monkeypatch.setattr(stages, "predict_overlap", predicted)
+    monkeypatch.setattr(stages, "predict_overlap_and_matches", predicted)
     monkeypatch.setattr(stages, "register_given_overlap", registered)
     monkeypatch.setattr(stages, "registration_loss", lambda *_: None)
     task = stages.make_task(settings, "registration", tmp_path)
