@@ -192,7 +192,7 @@ BAD_COMMANDS = {
     "batch of three": (["--batch", "three.txt"], "three.txt:1 must hold two paths; got 3"),
     "batch unquoted": (["--batch", "quote.txt"], "No closing quotation"),
     "no batch": (["--batch", "no.txt"], "no.txt"),
-    "half a pair": (["--batch", "half"], "must hold one a_source.* and one a_target.*; got 1 and 0"),
+    "half a pair": (["--batch", "half"], "and one a_target.*; got 1 and 0. Rename"),
 }
 
 
