@@ -117,8 +117,20 @@ def load_pretrained(name: str = "cad") -> Params:
 
 
 def load_named(name: str) -> Params:
-    """Weights by the path of a ``.npz`` file, or by their name in the package."""
-    return load_params(name) if name.endswith(".npz") else load_pretrained(name)
+    """Weights by the path of a ``.npz`` file, or by their name in the package.
+
+    Raises:
+      FileNotFoundError: no such file.
+      CheckpointError: no such name; otherwise as `load_params`.
+    """
+    if not name.endswith(".npz"):
+        return load_pretrained(name)
+    if not Path(name).exists():
+        raise FileNotFoundError(
+            f"weights must be a .npz file, or a name in the package; there is no file {name}. "
+            "Train first, or give --params=cad."
+        )
+    return load_params(name)
 
 
 def _checksum(header: str, arrays: Mapping[str, np.ndarray]) -> str:

@@ -147,7 +147,7 @@ def test_the_script_prints_the_table_and_writes_it(tmp_path):
 @pytest.mark.parametrize(
     ("flag", "message"),
     [
-        ("--params=nothing.npz", "nothing.npz"),
+        ("--params=nothing.npz", "there is no file nothing.npz. Train first"),
         ("--params=unknown", "name must be one of the weights"),
         ("--run_dir=no_such_run", "must hold a validated checkpoint; no_such_run has none"),
         ("--config.protocol.point=3", "it has no"),
