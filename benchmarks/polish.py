@@ -19,13 +19,11 @@ from dbdnet_jax.data.pairs import Protocol, make_pair
 from dbdnet_jax.metrics import motion_errors
 from dbdnet_jax.ops import rigid
 from dbdnet_jax.ops.sampling import random_direction
-from dbdnet_jax.polish import choose, polish
+from dbdnet_jax.polish import explore, polish
 from dbdnet_jax.types import Pair, Rigid
 
 PROTOCOLS = {"noise": Protocol(), "noise, disjoint": Protocol(disjoint=True)}
 ANGLES_DEG = (2.0, 5.0, 10.0, 20.0, 30.0)
-TURNS_DEG = (-25.0, 25.0)  # about each axis, of the seven starts
-WRONG_LABELS = 0.2  # part of the overlap labels that are turned over
 
 
 def draw_pairs(protocol: Protocol) -> Pair:
@@ -52,34 +50,19 @@ def perturbed(key: PRNGKeyArray, pair: Pair, degrees: Float[Array, ""]) -> Rigid
 
 
 def plain(pair: Pair, start: Rigid) -> Rigid:
-    """`polish` on the clouds alone."""
+    """`polish` of one pose."""
     return polish(pair.source, pair.target, start).target_from_source
 
 
-def with_overlap(pair: Pair, start: Rigid) -> Rigid:
-    """`polish` with overlap labels of which a fifth are wrong, as probabilities 0.95 and 0.05."""
-    wrong = jax.random.bernoulli(jax.random.key(0), WRONG_LABELS, (2, len(pair.source_overlap)))
-    overlaps = [
-        jnp.where(label ^ flipped, 0.95, 0.05)
-        for label, flipped in zip((pair.source_overlap, pair.target_overlap), wrong, strict=True)
-    ]
-    return polish(pair.source, pair.target, start, *overlaps, first_radius=0.3).target_from_source
-
-
-def seven_starts(pair: Pair, start: Rigid) -> Rigid:
-    """`choose` among the polished start and its polished turns."""
-    turns = [rigid.rotation_about(axis, jnp.deg2rad(a)) for axis in jnp.eye(3) for a in TURNS_DEG]
-    poses = [start, *(turned(start, pair, turn) for turn in turns)]
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *poses)
-    polished = jax.lax.map(lambda pose: plain(pair, pose), stacked)
-    return choose(pair.source, pair.target, polished)
+def from_turns(pair: Pair, start: Rigid) -> Rigid:
+    """`explore`: of the refined pose and its refined turns the one that fits clearly better."""
+    return explore(pair.source, pair.target, start).target_from_source
 
 
 METHODS = {
     "start": lambda pair, start: start,
     "polish": plain,
-    "polish, overlap 80 % right": with_overlap,
-    "polish, seven starts": seven_starts,
+    "explore": from_turns,
 }
 
 
@@ -105,7 +88,7 @@ def main() -> None:
                 seconds = (time.process_time() - start) / len(keys)
                 angle = errors.rotation_deg
                 print(
-                    f"{name:16s} {method:28s} {degrees:4.0f} deg: {angle.mean():6.2f} "
+                    f"{name:16s} {method:8s} {degrees:4.0f} deg: {angle.mean():6.2f} "
                     f"{np.median(angle):6.2f} {errors.translation.mean():6.3f} {seconds:7.4f} s"
                 )
 

@@ -119,16 +119,16 @@ def align(
     starts = [proposal.transform]
     if initial is not None:
         starts.append(guess_in_scene(scene))
-    pose = _elect(starts, scene, distance, refine)
+    pose = _elect(starts, scene, refine)
     laps["refine"] = time.perf_counter()
     return _report(scene, proposal, pose, distance, laps)
 
 
-def _elect(starts: list[Transform], scene: Scene, distance: float, refine: bool) -> Transform:
+def _elect(starts: list[Transform], scene: Scene, refine: bool) -> Transform:
     """The pose that fits best; if asked for, refined on few points, then on all that are kept."""
     clouds = scene.source.sparse, scene.target.sparse
-    poses = [search.explore(pose, *clouds, distance) for pose in starts] if refine else starts
-    best = min(poses, key=lambda pose: search.misfit(pose, *clouds, distance))
+    poses = [search.explore(pose, *clouds) for pose in starts] if refine else starts
+    best = min(poses, key=lambda pose: search.misfit(pose, *clouds))
     return search.refine(best, scene.source.dense, scene.target.dense) if refine else best
 
 
@@ -138,7 +138,7 @@ def _report(
     """Everything that is known of a pose, in the units and rows of the clouds as given."""
     clouds = scene.source.sparse, scene.target.sparse
     judgement = judge(search.move(pose, scene.source.dense), scene.target.dense, distance)
-    rival = search.best_rival(pose, *clouds, distance)
+    rival = search.best_rival(pose, *clouds)
     evidence = gather(proposal, pose, judgement, rival, *clouds)
     probability = success_probability(evidence, load_coefficients())
     reason = doubt(scene, proposal, judgement, probability)

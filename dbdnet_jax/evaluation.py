@@ -35,7 +35,7 @@ from dbdnet_jax.metrics import (
 from dbdnet_jax.model.dbdnet import register_clouds, register_given_overlap
 from dbdnet_jax.model.params import Params, init_params
 from dbdnet_jax.pair_sets import load_test_pairs
-from dbdnet_jax.polish import polish
+from dbdnet_jax.polish import explore
 from dbdnet_jax.recall import ScanRecall, Scans, correspondence_rmse_m, scan_recall
 from dbdnet_jax.settings import Settings
 from dbdnet_jax.types import Pair, Registration, Rigid
@@ -184,7 +184,7 @@ def from_network(params: Params) -> Method:
 
 
 def from_polished_network(params: Params) -> Method:
-    """The network's motion, refined on the clouds themselves: no ground truth, no normals given."""
+    """The network's motion, refined as `explore` does: no ground truth, no normals given."""
     compiled = jax.jit(_register_and_polish)
     return lambda pair: compiled(params, pair)
 
@@ -269,7 +269,7 @@ def _register(params: Params, pair: Pair) -> Registration:
 def _register_and_polish(params: Params, pair: Pair) -> Rigid:
     answer = _register(params, pair)
     motion = Rigid(answer.rotation, answer.translation)
-    return polish(pair.source, pair.target, motion).target_from_source
+    return explore(pair.source, pair.target, motion).target_from_source
 
 
 def _register_given_labels(params: Params, pair: Pair) -> Rigid:

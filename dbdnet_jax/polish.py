@@ -1,10 +1,10 @@
-"""Local refinement of a pose, kept only where it fits better, and a choice among several poses.
+"""Local refinement of a pose, from it and from turns of it; kept unless it fits clearly worse.
 
 Expectation maximisation in place of nearest neighbours (Granger & Pennec 2002): every point is
 matched softly to all points within a radius that shrinks, which is smooth, tells well matched
 points from those without a counterpart, and is faster than a search. The step minimises the
 distances along the normals of both clouds and, weakly, those in all directions. Lengths are in
-units of the shape's radius.
+units of the shape's radius, and of clouds of more than 1024 points an even choice is taken.
 """
 
 from functools import partial
@@ -22,15 +22,17 @@ from dbdnet_jax.ops.sampling import prefix_mask
 from dbdnet_jax.types import Cloud, Rigid
 
 # Chosen on validation pairs of the embedded shapes, with noise and with disjoint draws.
-FIRST_RADIUS = 0.18  # 0.3, with overlap probabilities at hand: they hold what it would pull away
+FIRST_RADIUS = 0.18
 LAST_RADIUS = 0.054
 ITERATIONS = 30
 ISOTROPY = 0.1  # weight of the distance in all directions, beside 1 along each normal
 OUTLIER_MASS = 1.0  # a point is half matched when the kernel's sum over the other cloud is this
 NEIGHBOURS = 12  # of a point, for its normal
 CAP = 0.05  # of the residual: farther points count as if they were this far
-MARGIN = 0.03
-MOST_POINTS = 1024  # an even choice of larger clouds: the lengths above suit this density
+SLACK = 0.02  # a refined pose may fit worse by this part: the right one of disjoint draws does
+MARGIN = 0.03  # a turned pose must fit better by this part
+NEAR_DEG = (-30.0, 30.0)  # turns that may lead out of a local minimum
+MOST_POINTS = 1024  # of a cloud: the lengths above suit this density
 
 
 class Polished(NamedTuple):
@@ -41,140 +43,143 @@ class Polished(NamedTuple):
     accepted: Bool[Array, ""]
 
 
-class _View(NamedTuple):
-    """A cloud of at most MOST_POINTS rows and the rows' weights, 0 for padding."""
+class _Scene(NamedTuple):
+    """Both clouds thinned, the target about its own centroid ``centre``, and their normals.
 
-    cloud: Cloud
-    weight: Float[Array, " n"]
+    So rotation and translation hardly depend on each other.
+    """
+
+    views: tuple[Cloud, Cloud]
+    normals: tuple[Float[Array, "n 3"], Float[Array, "m 3"]]
+    centre: Float[Array, "3"]
 
 
 @partial(jax.jit, static_argnames="iterations")
 def polish(
-    source: Cloud,
-    target: Cloud,
-    initial: Rigid,
-    source_overlap: Float[Array, " n"] | None = None,
-    target_overlap: Float[Array, " m"] | None = None,
-    *,
-    first_radius: float | Float[Array, ""] = FIRST_RADIUS,
-    last_radius: float | Float[Array, ""] = LAST_RADIUS,
-    iterations: int = ITERATIONS,
+    source: Cloud, target: Cloud, initial: Rigid, *, iterations: int = ITERATIONS
 ) -> Polished:
-    """Refine ``initial`` (target_from_source), or keep it where the result fits worse.
+    """Refine ``initial`` (target_from_source), or keep it where the result fits clearly worse.
 
-    The overlaps are probabilities that a point has a counterpart; each point counts by its own.
-    Without them every point counts the same. From clouds of more than 1024 points an even choice
-    is taken. Pure, of fixed cost, and without a gradient of use.
+    Pure, of fixed cost, and without a gradient of use.
     """
-    views = _thin(source, source_overlap), _thin(target, target_overlap)
-    # Around the target's centroid, so that rotation and translation hardly depend on each other.
-    centre = views[1].weight @ views[1].cloud.points / jnp.maximum(views[1].weight.sum(), 1e-6)
-    views = views[0], _shift(views[1], -centre)
-    start = Rigid(initial.rotation, initial.translation - centre)
-    normals = [estimate_normals(*view.cloud, NEIGHBOURS) for view in views]
-    radii = jnp.geomspace(first_radius, last_radius, iterations)
+    return _polish(_prepare(source, target), initial, iterations)
 
-    def step(motion, radius):
-        return _step(motion, views, normals, radius), None
 
-    end = jax.lax.scan(step, start, radii)[0]
-    before, after = _residual(views, start), _residual(views, end)
-    accepted = after <= before
-    best = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), end, start)
-    motion = Rigid(best.rotation, best.translation + centre)
-    return Polished(motion, jnp.where(accepted, after, before), accepted)
+@partial(jax.jit, static_argnames="angles_deg")
+def polish_turns(
+    source: Cloud, target: Cloud, initial: Rigid, angles_deg: tuple[float, ...]
+) -> Polished:
+    """Refine a pose and its turns about the principal axes through the moved source's middle.
+
+    Every leaf has a leading axis of 1 + 3 * len(angles_deg): first the pose itself.
+    """
+    scene = _prepare(source, target)
+    starts = _turned(scene.views[0], initial, angles_deg)
+    return jax.lax.map(lambda start: _polish(scene, start, ITERATIONS), starts)
 
 
 @jax.jit
-def residual(
-    source: Cloud,
-    target: Cloud,
-    target_from_source: Rigid,
-    source_overlap: Float[Array, " n"] | None = None,
-    target_overlap: Float[Array, " m"] | None = None,
-) -> Float[Array, ""]:
+def explore(source: Cloud, target: Cloud, initial: Rigid) -> Polished:
+    """The refined pose, or a refined turn of it by 30 degrees that fits clearly better.
+
+    Slightly better is no reason: a wrong pose that lays more of the clouds over each other may
+    fit as well as the right one.
+    """
+    found = polish_turns(source, target, initial, NEAR_DEG)
+    best = jnp.argmin(found.residual.at[0].multiply(1.0 - MARGIN))
+    return jax.tree.map(lambda leaf: leaf[best], found)
+
+
+@jax.jit
+def residual(source: Cloud, target: Cloud, target_from_source: Rigid) -> Float[Array, ""]:
     """How badly a pose fits: root mean square distance of each cloud's points to the other cloud.
 
     Distances above 0.05 count as 0.05, so points without a counterpart say little: 0 is a perfect
-    fit of everything, 0.05 none. The overlaps weigh the points.
+    fit of everything, 0.05 none.
     """
-    views = _thin(source, source_overlap), _thin(target, target_overlap)
-    return _residual(views, target_from_source)
+    return _residual((_thin(source), _thin(target)), target_from_source)
 
 
-@jax.jit
-def choose(
-    source: Cloud,
-    target: Cloud,
-    candidates: Rigid,
-    source_overlap: Float[Array, " n"] | None = None,
-    target_overlap: Float[Array, " m"] | None = None,
-    *,
-    margin: float | Float[Array, ""] = MARGIN,
-) -> Rigid:
-    """The candidate of least `residual`, from motions stacked along the first axis.
-
-    The first one stands unless another's residual is smaller by the part ``margin`` of it: wrong
-    poses that lay more of the clouds over each other fit as well as the right one. So put the
-    most trusted first, and polish all of them before.
-    """
-    views = _thin(source, source_overlap), _thin(target, target_overlap)
-    residuals = jax.lax.map(lambda motion: _residual(views, motion), candidates)
-    best = jnp.argmin(residuals.at[0].multiply(1.0 - margin))
-    return jax.tree.map(lambda leaf: leaf[best], candidates)
+def _prepare(source: Cloud, target: Cloud) -> _Scene:
+    source, target = _thin(source), _thin(target)
+    centre = _middle(target.points, target)
+    target = target._replace(points=target.points - centre[None, :])
+    normals = estimate_normals(*source, NEIGHBOURS), estimate_normals(*target, NEIGHBOURS)
+    return _Scene((source, target), normals, centre)
 
 
-def _thin(cloud: Cloud, overlap: Float[Array, " n"] | None) -> _View:
-    """At most MOST_POINTS rows, evenly over the valid ones, and what they weigh."""
+def _thin(cloud: Cloud) -> Cloud:
+    """At most MOST_POINTS rows, evenly over the valid ones; padding becomes zeros."""
     size = min(cloud.points.shape[0], MOST_POINTS)
     rows = jnp.arange(size) * jnp.maximum(cloud.count, size) // size
     count = jnp.minimum(cloud.count, size)
-    valid = prefix_mask(size, count)
-    points = jnp.where(valid[:, None], cloud.points[rows], 0.0)
-    weight = valid.astype(points.dtype) if overlap is None else jnp.where(valid, overlap[rows], 0.0)
-    return _View(Cloud(points, count), weight)
+    return Cloud(jnp.where(prefix_mask(size, count)[:, None], cloud.points[rows], 0.0), count)
 
 
-def _shift(view: _View, offset: Float[Array, "3"]) -> _View:
-    return view._replace(cloud=view.cloud._replace(points=view.cloud.points + offset[None, :]))
+def _middle(points: Float[Array, "n 3"], cloud: Cloud) -> Float[Array, "3"]:
+    """The mean of the valid rows of ``points``."""
+    return _valid(cloud) @ points / jnp.maximum(cloud.count, 1)
 
 
-def _residual(views: tuple[_View, _View], motion: Rigid) -> Float[Array, ""]:
+def _turned(source: Cloud, pose: Rigid, angles_deg: tuple[float, ...]) -> Rigid:
+    """The pose and its turns, stacked; see `polish_turns`."""
+    moved = rigid.apply(pose, source.points)
+    middle = _middle(moved, source)
+    arms = jnp.where(_valid(source)[:, None], moved - middle[None, :], 0.0)
+    axes = jnp.linalg.eigh(jnp.matmul(arms.T, arms, precision=HIGHEST))[1].T
+    angles = jnp.deg2rad(jnp.array(angles_deg, moved.dtype))
+    turns = jax.vmap(jax.vmap(rigid.rotation_about, (None, 0)), (0, None))(axes, angles)
+    turns = jnp.concatenate([jnp.eye(3)[None], turns.reshape(-1, 3, 3)])
+    about = jax.vmap(lambda turn: Rigid(turn, middle - turn @ middle))(turns)
+    return jax.vmap(rigid.compose, (0, None))(about, pose)
+
+
+def _polish(scene: _Scene, initial: Rigid, iterations: int) -> Polished:
+    start = Rigid(initial.rotation, initial.translation - scene.centre)
+    radii = jnp.geomspace(FIRST_RADIUS, LAST_RADIUS, iterations)
+    end = jax.lax.scan(lambda at, radius: (_step(scene, at, radius), None), start, radii)[0]
+    before, after = _residual(scene.views, start), _residual(scene.views, end)
+    accepted = after <= (1.0 + SLACK) * before
+    best = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), end, start)
+    motion = Rigid(best.rotation, best.translation + scene.centre)
+    return Polished(motion, jnp.where(accepted, after, before), accepted)
+
+
+def _residual(views: tuple[Cloud, Cloud], motion: Rigid) -> Float[Array, ""]:
     source, target = views
-    squares = squared_distances(rigid.apply(motion, source.cloud.points), target.cloud.points)
-    valid = [prefix_mask(len(view.weight), view.cloud.count) for view in views]
-    squares = jnp.where(valid[0][:, None] & valid[1][None, :], squares, jnp.inf)
+    squares = squared_distances(rigid.apply(motion, source.points), target.points)
+    rows, columns = _valid(source), _valid(target)
+    squares = jnp.where(rows[:, None] & columns[None, :], squares, jnp.inf)
     squares = jnp.minimum(squares, CAP**2)
-    weighted = source.weight @ squares.min(axis=1) + target.weight @ squares.min(axis=0)
-    total = source.weight.sum() + target.weight.sum()
-    return jnp.sqrt(weighted / jnp.maximum(total, 1e-6))
+    total = rows @ squares.min(axis=1) + columns @ squares.min(axis=0)
+    return jnp.sqrt(total / jnp.maximum(source.count + target.count, 1))
 
 
-def _step(
-    motion: Rigid,
-    views: tuple[_View, _View],
-    normals: list[Float[Array, "n 3"]],
-    radius: Float[Array, ""],
-) -> Rigid:
+def _valid(cloud: Cloud) -> Bool[Array, " n"]:
+    return prefix_mask(len(cloud.points), cloud.count)
+
+
+def _step(scene: _Scene, motion: Rigid, radius: Float[Array, ""]) -> Rigid:
     """One Gauss-Newton step on ``sum_ij P_ij e^T M_ij e`` with ``e = R s_i + t - q_j``.
 
     P is the soft matching and ``M_ij = 0.1 I + 0.9 (a_i a_i^T + b_j b_j^T)``, a and b the normals.
     All that depends on j enters through one product of P with features of the target's points.
     """
-    moved = rigid.apply(motion, views[0].cloud.points)
-    target = views[1].cloud.points
+    source, target = scene.views
+    normals = scene.normals
+    moved = rigid.apply(motion, source.points)
     across = _outer(jnp.matmul(normals[0], motion.rotation.T, precision=HIGHEST))
     target_across = _outer(normals[1])
     features = jnp.concatenate(
         [
-            jnp.ones((len(target), 1)),
-            target,
+            jnp.ones((len(target.points), 1)),
+            target.points,
             target_across.reshape(-1, 9),
-            jnp.einsum("nij,nj->ni", target_across, target),
+            jnp.einsum("nij,nj->ni", target_across, target.points),
         ],
         axis=1,
     )
-    matching = _match(moved, target, views[0].weight, views[1].weight, radius)
+    matching = _match(source._replace(points=moved), target, radius)
     sums = jnp.matmul(matching, features, precision=HIGHEST)
     mass, mean, metric, metric_mean = jnp.split(sums, [1, 4, 13], axis=1)
     own = ISOTROPY * jnp.eye(3)[None] + (1 - ISOTROPY) * across
@@ -193,16 +198,11 @@ def _step(
     return rigid.compose(Rigid(rigid.rotation_about(turn / angle, angle), shift), motion)
 
 
-def _match(
-    moved: Float[Array, "n 3"],
-    target: Float[Array, "m 3"],
-    moved_weight: Float[Array, " n"],
-    target_weight: Float[Array, " m"],
-    radius: Float[Array, ""],
-) -> Float[Array, "n m"]:
+def _match(moved: Cloud, target: Cloud, radius: Float[Array, ""]) -> Float[Array, "n m"]:
     """Soft matching, the sum of both ways; what has little within the radius is hardly matched."""
-    kernel = jnp.maximum(1.0 - squared_distances(moved, target) / radius**2, 0.0) ** 2
-    kernel = kernel * moved_weight[:, None] * target_weight[None, :]
+    squares = squared_distances(moved.points, target.points)
+    kernel = jnp.maximum(1.0 - squares / radius**2, 0.0) ** 2
+    kernel = jnp.where(_valid(moved)[:, None] & _valid(target)[None, :], kernel, 0.0)
     forth = 1.0 / (OUTLIER_MASS + kernel.sum(axis=1))
     back = 1.0 / (OUTLIER_MASS + kernel.sum(axis=0))
     return kernel * (forth[:, None] + back[None, :])

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from dbdnet_jax import polish as module
 from dbdnet_jax.data.procedural import procedural_shapes
-from dbdnet_jax.polish import CAP, choose, polish, residual
+from dbdnet_jax.polish import CAP, explore, polish, polish_turns, residual
 from dbdnet_jax.types import Cloud, Rigid
 from tests.conftest import EXACT, FLOAT32, Tolerance, assert_close, assert_finite
 
@@ -85,7 +85,7 @@ def test_the_answer_moves_with_the_clouds(crops):
 
 def test_a_result_that_fits_worse_is_rejected(crops, monkeypatch):
     monkeypatch.setattr(
-        module, "_step", lambda motion, *_: motion._replace(translation=motion.translation + 0.01)
+        module, "_step", lambda _, at, __: at._replace(translation=at.translation + 0.01)
     )
     start = motion(1.0)
     found = polish(*crops, start, iterations=9)  # a program of its own
@@ -104,17 +104,6 @@ def test_padding_changes_nothing(crops):
     assert_close(long.translation, short.translation, PADDING)
 
 
-def test_a_point_of_no_weight_is_no_point(crops):
-    """Rows of overlap 0 may stand anywhere in the source."""
-    source, target = crops
-    weights = jnp.where(jnp.arange(SIZE) < 200, 1.0, 0.0)
-    ones = jnp.ones(SIZE)
-    far = source._replace(points=source.points.at[200:].add(50.0))
-    moved, given = (residual(c, target, IDENTITY, weights, 0 * ones) for c in (far, source))
-    assert_close(moved, given, FLOAT32)
-    assert residual(far, target, IDENTITY, ones, ones) > given
-
-
 def test_the_residual_equals_its_definition(crops):
     start = motion(7.0, 0.02)
     source, target = (np.float64(c.points)[: int(c.count)] for c in crops)
@@ -124,23 +113,54 @@ def test_the_residual_equals_its_definition(crops):
     assert_close(residual(*crops, start), expected, Tolerance(rtol=1e-4, atol=0.0))
 
 
-def test_choose_takes_the_best_and_trusts_the_first(crops):
-    angles = (2.0, 0.0, 20.0)
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(motion, angles))
-    assert_close(choose(*crops, stacked).rotation, np.eye(3), FLOAT32)
-    trusting = choose(*crops, stacked, margin=0.9)
-    assert_close(trusting.rotation, motion(2.0).rotation, FLOAT32)
+def test_turns_are_polished_each_for_itself(crops):
+    """About the principal axes through the middle of the moved source, the pose itself first."""
+    source, target = crops
+    pose = motion(6.0, 0.02)
+    found = polish_turns(source, target, pose, (-40.0, 40.0))
+    moved = np.float64(source.points[: int(source.count)]) @ np.float64(pose.rotation).T + 0.02
+    middle = moved.mean(axis=0)
+    turns = [np.eye(3)]
+    for axis in np.linalg.svd(moved - middle)[2][::-1]:
+        turns += [Rotation.from_rotvec(x * axis, degrees=True).as_matrix() for x in (-40, 40)]
+    starts = [
+        Rigid(turn @ pose.rotation, middle + turn @ (pose.translation - middle)) for turn in turns
+    ]
+    expected = [polish(source, target, jax.tree.map(jnp.float32, start)) for start in starts]
+    assert_close(found.residual[0], expected[0].residual, FLOAT32)
+    # An axis may point either way, so the two turns about it may change places.
+    for k in (1, 3, 5):
+        pairs = (
+            np.sort(found.residual[k : k + 2]),
+            np.sort([x.residual for x in expected[k : k + 2]]),
+        )
+        assert_close(pairs[0], pairs[1], Tolerance(rtol=0.02, atol=0.0))
+
+
+def test_explore_leaves_a_local_minimum_and_trusts_the_first(crops, monkeypatch):
+    source, target = crops
+    lost = motion(78.0)
+    assert angle_deg(polish(source, target, lost).target_from_source) > 5
+    assert angle_deg(explore(source, target, lost).target_from_source) < 2
+    monkeypatch.setattr(module, "MARGIN", 0.95)  # no other pose fits so much better
+    explore.clear_cache()
+    trusting = explore(source, target, lost).target_from_source
+    explore.clear_cache()
+    assert_close(
+        trusting.rotation, polish(source, target, lost).target_from_source.rotation, PADDING
+    )
 
 
 def test_large_clouds_are_thinned_evenly(points):
     limit = module.MOST_POINTS
     dense = np.tile(points, (10, 1))
-    view = module._thin(cloud(dense, 4096), None)
-    assert view.cloud.points.shape == (limit, 3) and view.cloud.count == limit
+    thin = module._thin(cloud(dense, 4096))
+    assert thin.points.shape == (limit, 3) and thin.count == limit
     rows = np.arange(limit) * len(dense) // limit
-    assert_close(view.cloud.points, np.float32(dense[rows]), EXACT)
-    few = module._thin(cloud(points, 4096), None)
-    assert few.cloud.count == SIZE and float(few.weight.sum()) == SIZE
+    assert_close(thin.points, np.float32(dense[rows]), EXACT)
+    few = module._thin(cloud(points, 4096))
+    assert few.count == SIZE
+    assert_close(few.points[:SIZE], np.float32(points), EXACT)
 
 
 def test_clouds_of_little_use_keep_the_pose_finite(degenerate):

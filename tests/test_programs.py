@@ -52,7 +52,7 @@ def test_fifty_sizes_are_traced_as_often_as_there_are_buckets(monkeypatch):
         return Polished(Rigid(*start), jnp.zeros(()), jnp.ones((), bool))
 
     monkeypatch.setattr(search, "register", register)
-    monkeypatch.setattr(search, "polish", polish)
+    monkeypatch.setattr(search.polish, "polish", polish)
     monkeypatch.setattr(search, "_PROGRAMS", {})
     # Not through files: the stand-in must not be kept as the network's program.
     monkeypatch.setattr(search, "load_or_trace", lambda function, *rest: jax.jit(function))

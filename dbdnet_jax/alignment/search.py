@@ -1,6 +1,6 @@
 """Poses of one pair at the network's scale: the network's own, refined ones, and their rivals."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import jax
@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from dbdnet_jax import polish
 from dbdnet_jax.model.config import ModelConfig
 from dbdnet_jax.model.dbdnet import register
 from dbdnet_jax.model.params import Params
 from dbdnet_jax.ops.sampling import prefix_mask
-from dbdnet_jax.polish import polish
 from dbdnet_jax.programs import load_or_trace
 from dbdnet_jax.types import Cloud, Rigid
 
@@ -21,12 +21,14 @@ OtherPoints = Float[np.ndarray, "m 3"]
 Transform = Float[np.ndarray, "4 4"]
 
 SMALLEST_BUCKET = 192
-REFINE_POINTS = 3072  # at most, of each cloud: a matrix of all distances stays small
-NEAR_DEG = (-30, 30)  # turns that may lead out of a local minimum, about the principal axes
-FAR_DEG = (90, 180, 270)  # turns of symmetric shapes: they tell of doubt, and are not followed
+FAR_DEG = (
+    90.0,
+    180.0,
+    270.0,
+)  # turns of symmetric shapes: they tell of doubt, and are not followed
 DIFFERENT_DEG = 15.0  # from the pose, of what counts as a rival
 NO_RIVAL = 3.0  # the margin where there is none
-CLEARLY = 0.94  # of a misfit: better by 3 % of the distance
+CROWD_MARGIN = 0.5  # a rival whose misfit is larger by this logarithm counts as 1/e of one
 
 _PROGRAMS: dict[tuple[ModelConfig, int], Callable] = {}  # as jax.jit keeps its own
 
@@ -44,11 +46,15 @@ class Proposal(NamedTuple):
 
 
 class Rival(NamedTuple):
-    """Another pose: how it differs, and the logarithm of its misfit per that of the pose."""
+    """The best other pose: how it differs, and the logarithm of its misfit per that of the pose.
+
+    ``crowd`` is the number of all rivals, each counted by ``exp(-margin / 0.5)``.
+    """
 
     angle_deg: float
     axis: Float[np.ndarray, "3"]
     margin: float
+    crowd: float
 
 
 def ask_network(params: Params, source: Points, target: OtherPoints) -> Proposal:
@@ -96,15 +102,40 @@ def _program(config: ModelConfig, size: int, *arguments) -> Callable:
     return _PROGRAMS[config, size]
 
 
-def refine(transform: Transform, source: Points, target: OtherPoints) -> Transform:
-    """The pose after `polish` on an even part of the clouds; exactly a rotation, in float64."""
-    source, target = (x[:: -(-len(x) // REFINE_POINTS)] for x in (source, target))
-    start = Rigid(
-        jnp.asarray(transform[:3, :3], jnp.float32), jnp.asarray(transform[:3, 3], jnp.float32)
-    )
-    clouds = list(_pad(source, target))
-    motion = jax.device_get(polish(clouds[0], clouds[1], start).target_from_source)
-    return as_transform(motion.rotation, motion.translation)
+def refine(pose: Transform, source: Points, target: OtherPoints) -> Transform:
+    """The pose after `polish` on an even part of the clouds."""
+    clouds = [points[:: -(-len(points) // polish.MOST_POINTS)] for points in (source, target)]
+    return _polished(polish.polish(*_pad(*clouds), _as_rigid(pose)))
+
+
+def explore(pose: Transform, source: Points, target: OtherPoints) -> Transform:
+    """The refined pose, or a refined neighbour of it that fits clearly better."""
+    return _polished(polish.explore(*_pad(source, target), _as_rigid(pose)))
+
+
+def misfit(pose: Transform, source: Points, target: OtherPoints) -> float:
+    """How badly a pose fits: the `residual`, a length."""
+    return float(polish.residual(*_pad(source, target), _as_rigid(pose)))
+
+
+def best_rival(pose: Transform, source: Points, target: OtherPoints) -> Rival:
+    """The best other pose among the refined turns of this one.
+
+    A turn that falls back to the pose itself is no rival.
+    """
+    turns = polish.NEAR_DEG + FAR_DEG
+    found = polish.polish_turns(*_pad(source, target), _as_rigid(pose), turns)
+    motions, residuals, _ = jax.device_get(found)
+    squares = (residuals / polish.CAP) ** 2 + 1e-3
+    margins = np.log(squares / squares[0])
+    others = [as_transform(*motion) for motion in zip(*motions, strict=True)]
+    angles, axes = zip(*(angle_between(other, pose) for other in others), strict=True)
+    rivals = np.flatnonzero(np.array(angles) > DIFFERENT_DEG)
+    if not rivals.size:
+        return Rival(180.0, np.eye(3)[0], NO_RIVAL, 0.0)
+    best = rivals[np.argmin(margins[rivals])]
+    crowd = np.exp(-margins[rivals] / CROWD_MARGIN).sum()
+    return Rival(angles[best], axes[best], min(float(margins[best]), NO_RIVAL), float(crowd))
 
 
 def _pad(*clouds: np.ndarray) -> Iterator[Cloud]:
@@ -116,6 +147,14 @@ def _pad(*clouds: np.ndarray) -> Iterator[Cloud]:
         padded = np.zeros((size, 3), np.float32)
         padded[: len(points)] = points
         yield Cloud(jnp.asarray(padded), jnp.asarray(len(points)))
+
+
+def _as_rigid(pose: Transform) -> Rigid:
+    return Rigid(jnp.asarray(pose[:3, :3], jnp.float32), jnp.asarray(pose[:3, 3], jnp.float32))
+
+
+def _polished(found: polish.Polished) -> Transform:
+    return as_transform(*jax.device_get(found.target_from_source))
 
 
 def as_transform(rotation: Float[np.ndarray, "3 3"], translation) -> Transform:
@@ -130,61 +169,6 @@ def as_transform(rotation: Float[np.ndarray, "3 3"], translation) -> Transform:
 def move(transform: Transform, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     """A point or points under a 4x4 transform."""
     return points @ transform[:3, :3].T + transform[:3, 3]
-
-
-def misfit(transform: Transform, source: Points, target: OtherPoints, distance: float) -> float:
-    """Mean over both clouds of the squared distance to the other, no more than 1 a point.
-
-    In units of ``distance`` squared: 0 is a perfect fit of everything, 1 none.
-    """
-    from scipy.spatial import cKDTree
-
-    moved = move(transform, source)
-    ways = (cKDTree(target).query(moved)[0], cKDTree(moved).query(target)[0])
-    return float(np.mean([(np.minimum(found / distance, 1.0) ** 2).mean() for found in ways]))
-
-
-def explore(pose: Transform, source: Points, target: OtherPoints, distance: float) -> Transform:
-    """The refined pose, or a refined neighbour of it that fits clearly better.
-
-    Slightly better is no reason: a wrong pose with more overlap may fit as well as the right one.
-    """
-    first = refine(pose, source, target)
-    fit = misfit(first, source, target, distance)
-    others = [refine(turned, source, target) for turned in _turns(pose, source, NEAR_DEG)]
-    fits = [misfit(other, source, target, distance) for other in others]
-    best = int(np.argmin(fits))
-    return others[best] if fits[best] < CLEARLY * fit else first
-
-
-def best_rival(pose: Transform, source: Points, target: OtherPoints, distance: float) -> Rival:
-    """The best other pose among the refined turns of this one.
-
-    A turn that falls back to the pose itself is no rival.
-    """
-    found = [Rival(180.0, np.eye(3)[0], NO_RIVAL)]
-    own = misfit(pose, source, target, distance)
-    for turned in _turns(pose, source, NEAR_DEG + FAR_DEG):
-        other = refine(turned, source, target)
-        angle, axis = angle_between(other, pose)
-        if angle > DIFFERENT_DEG:
-            ratio = (misfit(other, source, target, distance) + 1e-3) / (own + 1e-3)
-            found.append(Rival(angle, axis, float(np.log(ratio))))
-    return min(found, key=lambda rival: rival.margin)
-
-
-def _turns(pose: Transform, source: Points, angles_deg: Sequence[int]) -> Iterator[Transform]:
-    """The pose turned about each principal axis of the moved source."""
-    from scipy.spatial.transform import Rotation
-
-    moved = move(pose, source)
-    middle = moved.mean(axis=0)
-    for axis in np.linalg.eigh(np.cov(moved.T))[1].T:
-        for degrees in angles_deg:
-            turn = np.eye(4)
-            turn[:3, :3] = Rotation.from_rotvec(degrees * axis, degrees=True).as_matrix()
-            turn[:3, 3] = middle - turn[:3, :3] @ middle
-            yield turn @ pose
 
 
 def angle_between(a: Transform, b: Transform) -> tuple[float, Float[np.ndarray, "3"]]:

@@ -24,14 +24,13 @@ class Evidence(NamedTuple):
     """What speaks for or against a pose; every entry free of units."""
 
     inliers: float  # part of the points of both clouds that have a counterpart
-    fewer_inliers: float  # the same of the cloud with the smaller part
     residual: float  # distance along the normals, root mean square, per inlier distance
     overlap: float  # mean predicted probability
-    agreement: float  # mean probability that the network gave to what the pose shows
     confidence: float  # mean over the matched points
     stiffness: float  # logarithm of the least held motion's stiffness
     correction: float  # logarithm of 1 + degrees between the network's pose and the refined one
-    rival: float  # logarithm of the best rival pose's error per this one's error
+    rival: float  # logarithm of the best rival pose's misfit per this one's misfit
+    crowd: float  # how many poses fit about as well
 
 
 def gather(
@@ -45,20 +44,17 @@ def gather(
     """The evidence for a pose; the clouds are those that the network saw, at its scale."""
     moved = move(pose, source)
     shown = near(moved, target, judgement.distance), near(target, moved, judgement.distance)
-    inliers = [float(x.mean()) for x in shown]
     predicted = proposal.source_overlap, proposal.target_overlap
-    wrong = [np.abs(p - x).mean() for p, x in zip(predicted, shown, strict=True)]
     kept = proposal.confidence[proposal.source_kept]
     return Evidence(
-        inliers=float(np.mean(inliers)),
-        fewer_inliers=min(inliers),
+        inliers=float(np.mean([x.mean() for x in shown])),
         residual=min(judgement.plane_rmse / judgement.distance, 1.0),
         overlap=float(np.mean([p.mean() for p in predicted])),
-        agreement=1 - float(np.mean(wrong)),
         confidence=float(kept.mean()) if kept.size else 0.0,
         stiffness=math.log(max(judgement.stiffness, 1e-6)),
         correction=math.log1p(angle_between(pose, proposal.transform)[0]),
         rival=rival.margin,
+        crowd=rival.crowd,
     )
 
 
