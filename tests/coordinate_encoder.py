@@ -16,12 +16,11 @@ class CoordinateEncoder(nn.Module):
     """A feature is where a point is, repeated; the encoder's own parameters are left alone."""
 
     channels: int
-    neighbours: int
     space: str
 
-    def __call__(self, cloud, skip_rows=None):
+    def __call__(self, points, pyramid):
         """(n, 4 channels), as the encoder's."""
-        return jnp.tile(cloud.points, (1, 2 * self.channels))[:, : 4 * self.channels]
+        return jnp.tile(points, (1, 2 * self.channels))[:, : 4 * self.channels]
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from dbdnet_jax.model.encoder import Encoder
 from dbdnet_jax.model.registration import ParameterNetwork
 from dbdnet_jax.ops.attention import position_code
 from dbdnet_jax.ops.grouping import interpolation_weights
+from dbdnet_jax.ops.pyramid import build_pyramid
 from dbdnet_jax.ops.sampling import farthest_order, inverse_order
 from dbdnet_jax.types import Cloud
 from tests.conftest import Tolerance, assert_close
@@ -55,11 +56,12 @@ class Encoded(NamedTuple):
 @jax.jit
 def encode(variables, cloud: Cloud):
     order = farthest_order(cloud.points, cloud.count)
-    encoder = Encoder(variables["stage1_conv1"]["conv_0"]["bias"].size, NEIGHBOURS, "feature")
+    encoder = Encoder(variables["stage1_conv1"]["conv_0"]["bias"].size, "feature")
+    ordered = Cloud(cloud.points[order], cloud.count)
     feature, state = encoder.apply(
         {"params": variables},
-        Cloud(cloud.points[order], cloud.count),
-        inverse_order(order),
+        ordered.points,
+        build_pyramid(ordered, NEIGHBOURS, inverse_order(order)),
         capture_intermediates=lambda module, method: isinstance(module, EdgeConv | Exchange),
     )
     return feature, order, state["intermediates"]

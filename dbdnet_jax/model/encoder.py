@@ -3,13 +3,12 @@
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from dbdnet_jax.model.blocks import Exchange
 from dbdnet_jax.model.edgeconv import EdgeConv
 from dbdnet_jax.ops.grouping import knn
-from dbdnet_jax.ops.pyramid import LEVELS, Pyramid, build_pyramid, query_down
-from dbdnet_jax.types import Cloud
+from dbdnet_jax.ops.pyramid import LEVELS, Pyramid, query_down
 
 GROUPS = (4, 4, 8, 8)  # of the group norms at levels 1 to 4
 
@@ -22,21 +21,13 @@ class Encoder(nn.Module):
     """
 
     channels: int
-    neighbours: int
     neighbour_space: str
 
     @nn.compact
-    def __call__(
-        self, cloud: Cloud, skip_rows: Int[Array, " n"] | None = None
-    ) -> Float[Array, "n d"]:
-        """Encode one cloud in farthest-point order.
-
-        ``skip_rows`` are the rows that the released code reads on its way down over two or more
-        levels (see `pyramid.query_down`); None reads the points' own rows.
-        """
-        pyramid = build_pyramid(cloud, self.neighbours, skip_rows)
+    def __call__(self, points: Float[Array, "n 3"], pyramid: Pyramid) -> Float[Array, "n d"]:
+        """Encode one cloud in farthest-point order; the pyramid may be of the cloud at rest."""
         history: list[list[jax.Array]] = [[] for _ in range(LEVELS)]
-        features = [pyramid.levels[0].points]
+        features = [points]
         for stage in range(1, LEVELS + 1):
             features = [
                 self._edgeconv(f"stage{stage}_conv{level + 1}", x, pyramid, level)
@@ -84,7 +75,7 @@ class Encoder(nn.Module):
                 if other > level:
                     parts.append(move.up(x, *pyramid.up[level][other - level - 1]))
                 elif level == opened and other == level - 1:
-                    rows = pyramid.levels[level].points.shape[0]
+                    rows = len(pyramid.levels[level].valid)
                     parts.append(move.pool(x, pyramid.levels[other].neighbours[:rows]))
                 else:
                     parts.append(move.down(query_down(x, pyramid, other, level)))

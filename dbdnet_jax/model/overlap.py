@@ -3,7 +3,7 @@
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from dbdnet_jax.model.blocks import Affine, AttentionBlock, DenseNorm, dense, over_clouds
 from dbdnet_jax.model.config import ModelConfig
@@ -11,6 +11,7 @@ from dbdnet_jax.model.encoder import Encoder
 from dbdnet_jax.model.matching import Matched, Matching, fit_features
 from dbdnet_jax.ops.attention import position_code
 from dbdnet_jax.ops.grouping import masked_max
+from dbdnet_jax.ops.pyramid import Pyramid
 from dbdnet_jax.ops.sampling import prefix_mask
 from dbdnet_jax.types import Cloud
 
@@ -22,21 +23,17 @@ class OverlapNetwork(nn.Module):
 
     @nn.compact
     def __call__(
-        self,
-        clouds: Cloud,
-        skip_rows: Int[Array, "2 n"] | None = None,
-        dropout_key: PRNGKeyArray | None = None,
+        self, clouds: Cloud, pyramids: Pyramid, dropout_key: PRNGKeyArray | None = None
     ) -> tuple[Float[Array, "2 n"], Matched | None]:
         """Logits of the points of two clouds, stacked, each in farthest-point order.
 
-        With ``overlap_matching`` also the soft matches that they follow from. Rows past a cloud's
-        count hold logits without meaning. Without a ``dropout_key`` the network is deterministic.
+        The pyramids may be of the clouds before a motion. With ``overlap_matching`` also the soft
+        matches that the logits follow from. Rows past a cloud's count hold logits without meaning.
+        Without a ``dropout_key`` the network is deterministic.
         """
         config = self.config
-        encoder = Encoder(
-            config.overlap_channels, config.neighbours, config.neighbour_space, name="encoder"
-        )
-        features = over_clouds(encoder, clouds, skip_rows)
+        encoder = Encoder(config.overlap_channels, config.neighbour_space, name="encoder")
+        features = over_clouds(encoder, clouds.points, pyramids)
         n, width = features.shape[1:]
         features = features + jax.vmap(lambda x: position_code(x, width))(clouds.points)
         valid = jax.vmap(lambda count: prefix_mask(n, count))(clouds.count)

@@ -12,6 +12,7 @@ from dbdnet_jax.model.config import ModelConfig
 from dbdnet_jax.model.encoder import Encoder
 from dbdnet_jax.ops.attention import position_code
 from dbdnet_jax.ops.grouping import masked_max, squared_distances
+from dbdnet_jax.ops.pyramid import build_pyramids
 from dbdnet_jax.ops.sampling import prefix_mask
 from dbdnet_jax.ops.sinkhorn import sinkhorn
 from dbdnet_jax.types import Cloud
@@ -55,9 +56,7 @@ class RegistrationNetwork(nn.Module):
     def setup(self):
         """Declare the encoder, the parameter network and the three stacks of blocks."""
         config = self.config
-        self.encoder = Encoder(
-            config.registration_channels, config.neighbours, config.neighbour_space
-        )
+        self.encoder = Encoder(config.registration_channels, config.neighbour_space)
         self.weight_net = ParameterNetwork(config)
 
         def stack(size):
@@ -80,7 +79,8 @@ class RegistrationNetwork(nn.Module):
         self, clouds: Cloud, skip_rows: Int[Array, "2 n"] | None = None
     ) -> Float[Array, "2 n d"]:
         """Point-wise features of two stacked clouds, each in farthest-point order."""
-        return over_clouds(self.encoder, clouds, skip_rows)
+        pyramids = build_pyramids(clouds, self.config.neighbours, skip_rows)
+        return over_clouds(self.encoder, clouds.points, pyramids)
 
     def match(
         self,

@@ -6,6 +6,7 @@ In that order (`sampling.farthest_order`) level l is the first ``n >> l`` rows, 
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -17,9 +18,8 @@ LEVELS = 4
 
 
 class Level(NamedTuple):
-    """One resolution: its points, and its neighbours among its own points in coordinates."""
+    """One resolution: which rows are points, and their neighbours among each other."""
 
-    points: Float[Array, "n 3"]
     count: Int[Array, ""]  # type: ignore[assignment]  # not tuple.count
     valid: Bool[Array, " n"]
     neighbours: Int[Array, "n k"]
@@ -45,26 +45,31 @@ def build_pyramid(cloud: Cloud, k: int, skip_rows: Int[Array, " n"] | None = Non
     first rows of the level's own neighbours. Every index is found once and shared by all layers.
     """
     n = cloud.points.shape[0]
-    levels = []
-    for level in range(LEVELS):
-        points, count = cloud.points[: n >> level], cloud.count >> level
-        valid = prefix_mask(n >> level, count)
-        levels.append(Level(points, count, valid, knn(points, points, k, count)))
+    clouds = [Cloud(cloud.points[: n >> level], cloud.count >> level) for level in range(LEVELS)]
+    levels = tuple(
+        Level(count, prefix_mask(len(points), count), knn(points, points, k, count))
+        for points, count in clouds
+    )
     up = tuple(
         tuple(
-            interpolation_weights(levels[fine].points, levels[coarse].points, levels[coarse].count)
+            interpolation_weights(clouds[fine].points, *clouds[coarse])
             for coarse in range(fine + 1, LEVELS)
         )
         for fine in range(LEVELS - 1)
     )
-    return Pyramid(tuple(levels), up, skip_rows)
+    return Pyramid(levels, up, skip_rows)
+
+
+def build_pyramids(clouds: Cloud, k: int, skip_rows: Int[Array, "2 n"] | None = None) -> Pyramid:
+    """The pyramids of two stacked clouds, stacked."""
+    return jax.lax.map(lambda one: build_pyramid(one[0], k, one[1]), (clouds, skip_rows))
 
 
 def query_down(
     features: Float[Array, "n c"], pyramid: Pyramid, fine: int, coarse: int
 ) -> Float[Array, "m c"]:
     """The rows of a finer level's feature that belong to the points of a coarser level."""
-    size = pyramid.levels[coarse].points.shape[0]
+    size = len(pyramid.levels[coarse].valid)
     if pyramid.skip_rows is not None and fine == 0 and coarse > 1:
         # Departure of the released code: its loop over index lists overwrites its own result, so
         # only the last list is applied, to the finest level's rows in input order.

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from dbdnet_jax.model.encoder import Encoder
+from dbdnet_jax.ops.pyramid import build_pyramid
 from tests import oracle
 from tests.conftest import assert_close, random_cloud
 from tests.model.small import NETWORK, SMALL, padded, small_params, whole
@@ -20,7 +21,8 @@ def farthest_first(points, count: int) -> np.ndarray:
 
 
 def encode_eagerly(params, cloud, skip_rows=None, space: str = "feature"):
-    return Encoder(CHANNELS, K, space).apply({"params": params}, cloud, skip_rows)
+    pyramid = build_pyramid(cloud, K, skip_rows)
+    return Encoder(CHANNELS, space).apply({"params": params}, cloud.points, pyramid)
 
 
 encode = jax.jit(encode_eagerly, static_argnums=3)

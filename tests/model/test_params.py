@@ -16,6 +16,7 @@ from dbdnet_jax.model.params import (
     unflatten,
 )
 from dbdnet_jax.model.registration import RegistrationNetwork
+from dbdnet_jax.ops.pyramid import build_pyramids
 from dbdnet_jax.safe_pickle import CheckpointError
 from dbdnet_jax.types import Cloud
 
@@ -35,9 +36,14 @@ CONFIG = ModelConfig(
 
 def test_the_list_is_what_initialising_makes():
     clouds = Cloud(jnp.zeros((2, 16, 3)), jnp.full((2,), 16))
+    pyramids = build_pyramids(clouds, CONFIG.neighbours)
+    networks = {
+        "overlap": (OverlapNetwork(CONFIG), clouds, pyramids),
+        "registration": (RegistrationNetwork(CONFIG), clouds),
+    }
     tree = {
-        name: jax.eval_shape(network(CONFIG).init, jax.random.key(0), clouds)["params"]
-        for name, network in (("overlap", OverlapNetwork), ("registration", RegistrationNetwork))
+        name: jax.eval_shape(network.init, jax.random.key(0), *inputs)["params"]
+        for name, (network, *inputs) in networks.items()
     }
     made = {name: leaf.shape for name, leaf in flatten_dict(tree, sep="/").items()}
     assert made == parameter_shapes(CONFIG)
