@@ -58,6 +58,11 @@ class Alignment:
     timings: dict[str, float]
 
     @property
+    def verdict(self) -> str:
+        """In a few words whether to trust the pose."""
+        return "aligned" if self.valid else "not aligned with confidence"
+
+    @property
     def rotation(self) -> Float[np.ndarray, "3 3"]:
         """The rotation of ``transform``."""
         return self.transform[:3, :3]

@@ -236,7 +236,6 @@ def summary(source: Path, target: Path, alignment: "Alignment") -> str:
 
     turn = Rotation.from_matrix(alignment.rotation).magnitude()
     rows = [" ".join(f"{x:16.9g}" for x in row) for row in alignment.transform]
-    verdict = "aligned" if alignment.valid else f"NOT ALIGNED with confidence: {alignment.reason}"
     laps = ", ".join(f"{name} {lap:.2f}" for name, lap in alignment.timings.items())
     return "\n".join(
         [
@@ -249,7 +248,7 @@ def summary(source: Path, target: Path, alignment: "Alignment") -> str:
             f"{SUCCESS_DEG:g} deg",
             *(f"warning      {warning}" for warning in alignment.warnings),
             f"time         {sum(alignment.timings.values()):.2f} s ({laps})",
-            verdict,
+            ": ".join(filter(None, (alignment.verdict, alignment.reason))),
         ]
     )
 

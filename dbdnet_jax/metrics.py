@@ -73,7 +73,7 @@ class Summary(NamedTuple):
     median_rotation_deg: float
     median_translation: float
     recall_5deg_0p1: float
-    recall_15deg_30cm: float
+    recall_15deg_0p3: float
     overlap: OverlapSummary | None
 
 
@@ -258,6 +258,6 @@ def summarise(errors: PairErrors) -> Summary:
         median_rotation_deg=float(np.median(rotation)),
         median_translation=float(np.median(translation)),
         recall_5deg_0p1=float(np.mean((rotation < 5) & (translation < 0.1))),
-        recall_15deg_30cm=float(np.mean((rotation < 15) & (translation < 0.3))),
+        recall_15deg_0p3=float(np.mean((rotation < 15) & (translation < 0.3))),
         overlap=summarise_overlap(errors.overlap),
     )

@@ -10,7 +10,7 @@ from jax import export
 
 from dbdnet_jax.files import cache_folder, write_whole
 
-TRACED = ("model/*.py", "ops/*.py", "types.py", "alignment/search.py")
+TRACED = ("model/*.py", "ops/*.py", "types.py", "polish.py", "alignment/search.py")
 
 
 def keep_compiled_programs() -> None:
@@ -28,7 +28,7 @@ def load_or_trace(function: Callable, name: str, *arguments) -> Callable:
 
     That is ``jax_compilation_cache_dir``; where it is not set, plain `jax.jit`. ``arguments`` and
     results must be arrays in dicts, lists and tuples. The file's name is the hash of ``name``, the
-    arguments' structure and shapes, the network's source and JAX's version.
+    arguments' structure and shapes, the source that is traced and JAX's version.
     """
     folder = jax.config.values["jax_compilation_cache_dir"]
     if folder is None:

@@ -58,7 +58,7 @@ MOTION_COLUMNS = (
     Column(("Error R", "median", "deg"), _figure("median_rotation_deg", 3)),
     Column(("Error t", "median", "unit"), _figure("median_translation", 4)),
     Column(("Recall", "< 5 deg", "& < 0.1"), _percent("summary", "recall_5deg_0p1")),
-    Column(("Recall", "< 15 deg", "& < 0.3"), _percent("summary", "recall_15deg_30cm")),
+    Column(("Recall", "< 15 deg", "& < 0.3"), _percent("summary", "recall_15deg_0p3")),
     Column(("Time", "median", "s/pair"), _seconds),
 )
 RECALL_COLUMNS = tuple(

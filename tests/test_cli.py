@@ -67,7 +67,7 @@ def test_an_unlikely_pose_is_status_1_with_its_reason(run, monkeypatch):
     likely(monkeypatch, 0.2)
     status, out, _ = run("a.ply", "b.ply")
     assert status == UNSURE
-    assert out.splitlines()[-1].startswith("NOT ALIGNED with confidence: the pose is right with")
+    assert out.splitlines()[-1].startswith("not aligned with confidence: the pose is right with")
 
 
 @pytest.mark.parametrize("ending", ["txt", "json", "npy"])

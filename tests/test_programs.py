@@ -8,6 +8,7 @@ import numpy as np
 
 from dbdnet_jax import programs
 from dbdnet_jax.alignment import search
+from dbdnet_jax.ops.sampling import prefix_mask
 from dbdnet_jax.polish import Polished
 from dbdnet_jax.types import Branch, Registration, Rigid
 from tests.aligning import tiny_params
@@ -16,21 +17,22 @@ from tests.conftest import random_cloud
 BUCKETS = {192, 384, 768, 1536}
 
 
-def answer_nothing(params, src, tgt, src_mask, tgt_mask) -> Registration:
-    """A stand-in for `register`: the right shapes, at no cost."""
-    n, m = len(src), len(tgt)
+def answer_nothing(params, source, target) -> Registration:
+    """A stand-in for `register_clouds`: the right shapes, at no cost."""
+    n, m = len(source.points), len(target.points)
+    masks = prefix_mask(n, source.count), prefix_mask(m, target.count)
     branch = Branch(jnp.zeros((n, m)), jnp.zeros((n, 3)), jnp.zeros(n))
     return Registration(
         rotation=jnp.eye(3),
         translation=jnp.zeros(3),
-        src_overlap=src_mask * 1.0,
-        tgt_overlap=tgt_mask * 1.0,
-        src_kept=src_mask,
-        tgt_kept=tgt_mask,
+        src_overlap=masks[0] * 1.0,
+        tgt_overlap=masks[1] * 1.0,
+        src_kept=masks[0],
+        tgt_kept=masks[1],
         rotation_branch=branch,
         translation_branch=branch,
         confidence=jnp.zeros(n),
-        valid=jnp.any(src_mask),
+        valid=source.count > 0,
     )
 
 
@@ -42,16 +44,16 @@ def test_every_file_that_a_kept_program_comes_of_is_there():
 def test_fifty_sizes_are_traced_as_often_as_there_are_buckets(monkeypatch):
     networks, polishes = [], []
 
-    def register(params, src, tgt, *masks):
-        networks.append((len(src), len(tgt)))
-        return answer_nothing(params, src, tgt, *masks)
+    def register_clouds(params, source, target):
+        networks.append((len(source.points), len(target.points)))
+        return answer_nothing(params, source, target)
 
     @jax.jit
     def polish(source, target, start):
         polishes.append((len(source.points), len(target.points)))
         return Polished(Rigid(*start), jnp.zeros(()), jnp.ones((), bool))
 
-    monkeypatch.setattr(search, "register", register)
+    monkeypatch.setattr(search, "register_clouds", register_clouds)
     monkeypatch.setattr(search.polish, "polish", polish)
     monkeypatch.setattr(search, "_PROGRAMS", {})
     # Not through files: the stand-in must not be kept as the network's program.

@@ -55,8 +55,18 @@ def test_pairs() -> Iterator[tuple[int, Pair]]:
         yield i, jax.tree.map(lambda leaf: leaf[i], pairs)  # noqa: B023
 
 
+def hold_readable(path: Path) -> None:
+    """Where the file is missing or of other evidence, one that says nothing: `align` reads it."""
+    try:
+        load_coefficients(path)
+    except (ValueError, OSError):
+        zeros, ones = (Evidence(*[x] * len(Evidence._fields))._asdict() for x in (0.0, 1.0))
+        nothing = {"mean": zeros, "deviation": ones, "weight": zeros, "bias": 0.0}
+        write_whole(path, json.dumps(nothing).encode())
+
+
 def examine(params: Params, pairs: Iterator[tuple[int, Pair]], count: int):
-    """Evidence (n, 9), success (n,), shape numbers (n,), rotation errors (n,) in degrees."""
+    """Evidence (n, fields), success (n,), shape numbers (n,), rotation errors (n,) in degrees."""
     rows, shapes, errors = [], [], []
     for shape, pair in tqdm(pairs, total=count):
         answer = align(pair.source.points, pair.target.points, params)
@@ -108,9 +118,9 @@ def area_under_curve(probability: np.ndarray, success: np.ndarray) -> float:
 
 
 def show(probability: np.ndarray, success: np.ndarray) -> dict:
-    """Print the reliability curve; return calibration error and area under the curve."""
+    """Print the reliability curve; return it, its calibration error and the area under the ROC."""
     print("probability      pairs   mean   right")
-    error = 0.0
+    error, curve = 0.0, []
     edges = np.linspace(0, 1, BINS + 1)
     for low, high in zip(edges, edges[1:], strict=False):
         inside = (probability >= low) & ((probability < high) | (high == 1))
@@ -118,7 +128,12 @@ def show(probability: np.ndarray, success: np.ndarray) -> dict:
             mean, right = probability[inside].mean(), success[inside].mean()
             error += inside.mean() * abs(mean - right)
             print(f"{low:.1f} .. {high:.1f} {inside.sum():12d} {mean:6.3f} {right:7.3f}")
-    figures = {"calibration_error": float(error), "auc": area_under_curve(probability, success)}
+            curve.append({"pairs": int(inside.sum()), "mean": float(mean), "right": float(right)})
+    figures = {
+        "calibration_error": float(error),
+        "auc": area_under_curve(probability, success),
+        "reliability": curve,
+    }
     print(f"{success.mean():.1%} of {len(success)} right (rotation off < {SUCCESS_DEG:g} degrees)")
     print(f"expected calibration error {error:.3f}, area under the ROC curve {figures['auc']:.3f}")
     return figures
@@ -138,6 +153,7 @@ def main() -> None:
         held = load_coefficients(options.output)
         show(np.array([probability_of(Evidence(*row), held) for row in evidence]), success)
         return
+    hold_readable(SUCCESS_FILE)
     evidence, success, shapes, errors = examine(
         params, validation_pairs(options.pairs), options.pairs
     )

@@ -5,8 +5,8 @@ python tools/freeze_cad.py
 
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.frozen import CAD_FOLDER, CAD_VARIANTS, freeze
+from dbdnet_jax.pair_sets import TEST_SEED
 
-SEED = 2024
 PAIRS = 200
 
 
@@ -15,7 +15,7 @@ def main() -> None:
     CAD_FOLDER.mkdir(exist_ok=True)
     for variant, (protocol, half) in CAD_VARIANTS.items():
         path = CAD_FOLDER / f"cad_test_{variant}.npz"
-        digest = freeze(path, cad_split("test", half), protocol, seed=SEED, count=PAIRS)
+        digest = freeze(path, cad_split("test", half), protocol, seed=TEST_SEED, count=PAIRS)
         print(f"{path.name}  sha256 {digest}")
 
 

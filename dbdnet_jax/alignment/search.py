@@ -1,7 +1,7 @@
 """Poses of one pair at the network's scale: the network's own, refined ones, and their rivals."""
 
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,10 +9,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from dbdnet_jax import polish
-from dbdnet_jax.model.config import ModelConfig
-from dbdnet_jax.model.dbdnet import register
+from dbdnet_jax.model.dbdnet import register_clouds
 from dbdnet_jax.model.params import Params
-from dbdnet_jax.ops.sampling import prefix_mask
 from dbdnet_jax.programs import load_or_trace
 from dbdnet_jax.types import Cloud, Rigid
 
@@ -30,7 +28,7 @@ DIFFERENT_DEG = 15.0  # from the pose, of what counts as a rival
 NO_RIVAL = 3.0  # the margin where there is none
 CROWD_MARGIN = 0.5  # a rival whose misfit is larger by this logarithm counts as 1/e of one
 
-_PROGRAMS: dict[tuple[ModelConfig, int], Callable] = {}  # as jax.jit keeps its own
+_PROGRAMS: dict[tuple[str, tuple], Callable] = {}  # by name and shapes, as jax.jit keeps its own
 
 
 class Proposal(NamedTuple):
@@ -59,12 +57,25 @@ class Rival(NamedTuple):
 
 def ask_network(params: Params, source: Points, target: OtherPoints) -> Proposal:
     """Register two clouds of any size; programs are compiled for a few sizes only."""
-    networks = jax.tree.map(
-        lambda x: jnp.asarray(x, jnp.float32), (params.overlap, params.registration)
-    )
-    arguments = *networks, *(tuple(cloud) for cloud in _pad(source, target))
-    program = _program(params.config, len(arguments[2][0]), *arguments)
-    answer = jax.device_get(program(*arguments))
+    config = params.config
+
+    def network(weights, source, target):
+        weights = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), weights)
+        answer = register_clouds(Params(*weights, config), Cloud(*source), Cloud(*target))
+        branches = answer.rotation_branch, answer.translation_branch
+        return (
+            answer.rotation,
+            answer.translation,
+            answer.src_overlap,
+            answer.tgt_overlap,
+            answer.src_kept,
+            sum(branch.correspondence for branch in branches) / 2,
+            answer.confidence,
+            answer.valid,
+        )
+
+    weights = params.overlap, params.registration
+    answer = _run(repr(config), network, weights, *_pad(source, target))
     rotation, translation, source_overlap, target_overlap, kept, mass, confidence, valid = answer
     n, m = len(source), len(target)
     return Proposal(
@@ -78,44 +89,23 @@ def ask_network(params: Params, source: Points, target: OtherPoints) -> Proposal
     )
 
 
-def _program(config: ModelConfig, size: int, *arguments) -> Callable:
-    """The compiled network of one configuration and size."""
-
-    def network(overlap, registration, source, target):
-        params = Params(overlap, registration, config)
-        masks = (prefix_mask(size, count) for _, count in (source, target))
-        answer = register(params, source[0], target[0], *masks)
-        branches = answer.rotation_branch, answer.translation_branch
-        return (
-            answer.rotation,
-            answer.translation,
-            answer.src_overlap,
-            answer.tgt_overlap,
-            answer.src_kept,
-            sum(branch.correspondence for branch in branches) / 2,
-            answer.confidence,
-            answer.valid,
-        )
-
-    if (config, size) not in _PROGRAMS:
-        _PROGRAMS[config, size] = load_or_trace(network, repr(config), *arguments)
-    return _PROGRAMS[config, size]
-
-
 def refine(pose: Transform, source: Points, target: OtherPoints) -> Transform:
     """The pose after `polish` on an even part of the clouds."""
     clouds = [points[:: -(-len(points) // polish.MOST_POINTS)] for points in (source, target)]
-    return _polished(polish.polish(*_pad(*clouds), _as_rigid(pose)))
+    rotation, translation, _ = _run_polish(polish.polish, pose, *clouds)
+    return as_transform(rotation, translation)
 
 
 def explore(pose: Transform, source: Points, target: OtherPoints) -> Transform:
     """The refined pose, or a refined neighbour of it that fits clearly better."""
-    return _polished(polish.explore(*_pad(source, target), _as_rigid(pose)))
+    rotation, translation, _ = _run_polish(polish.explore, pose, source, target)
+    return as_transform(rotation, translation)
 
 
 def misfit(pose: Transform, source: Points, target: OtherPoints) -> float:
     """How badly a pose fits: the `residual`, a length."""
-    return float(polish.residual(*_pad(source, target), _as_rigid(pose)))
+    clouds = (Cloud(*cloud) for cloud in _pad(source, target))
+    return float(polish.residual(*clouds, Rigid(*_as_rigid(pose))))
 
 
 def best_rival(pose: Transform, source: Points, target: OtherPoints) -> Rival:
@@ -123,9 +113,7 @@ def best_rival(pose: Transform, source: Points, target: OtherPoints) -> Rival:
 
     A turn that falls back to the pose itself is no rival.
     """
-    turns = polish.NEAR_DEG + FAR_DEG
-    found = polish.polish_turns(*_pad(source, target), _as_rigid(pose), turns)
-    motions, residuals, _ = jax.device_get(found)
+    *motions, residuals = _run_polish(_all_turns, pose, source, target)
     squares = (residuals / polish.CAP) ** 2 + 1e-3
     margins = np.log(squares / squares[0])
     others = [as_transform(*motion) for motion in zip(*motions, strict=True)]
@@ -138,23 +126,43 @@ def best_rival(pose: Transform, source: Points, target: OtherPoints) -> Rival:
     return Rival(angles[best], axes[best], min(float(margins[best]), NO_RIVAL), float(crowd))
 
 
-def _pad(*clouds: np.ndarray) -> Iterator[Cloud]:
-    """The clouds at the next of a few sizes: 192, 384, 768, 1536, ..."""
+def _all_turns(source: Cloud, target: Cloud, pose: Rigid) -> polish.Polished:
+    return polish.polish_turns(source, target, pose, polish.NEAR_DEG + FAR_DEG)
+
+
+def _run_polish(
+    function: Callable, pose: Transform, source: Points, target: OtherPoints
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rotation, translation and residual that a function of `polish` finds from the pose."""
+
+    def arrays(source, target, start):
+        found = function(Cloud(*source), Cloud(*target), Rigid(*start))
+        return *found.target_from_source, found.residual
+
+    return _run(function.__name__, arrays, *_pad(source, target), _as_rigid(pose))
+
+
+def _run(name: str, function: Callable, *arguments: Any) -> Any:
+    """The function's results on the host, through a program kept for arguments of these shapes."""
+    key = name, tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(arguments))
+    if key not in _PROGRAMS:
+        _PROGRAMS[key] = load_or_trace(function, name, *arguments)
+    return jax.device_get(_PROGRAMS[key](*arguments))
+
+
+def _pad(*clouds: np.ndarray) -> Iterator[tuple[jax.Array, jax.Array]]:
+    """Points and count of clouds at the next of a few sizes: 192, 384, 768, 1536, ..."""
     size = SMALLEST_BUCKET
     while size < max(len(points) for points in clouds):
         size *= 2
     for points in clouds:
         padded = np.zeros((size, 3), np.float32)
         padded[: len(points)] = points
-        yield Cloud(jnp.asarray(padded), jnp.asarray(len(points)))
+        yield jnp.asarray(padded), jnp.asarray(len(points))
 
 
-def _as_rigid(pose: Transform) -> Rigid:
-    return Rigid(jnp.asarray(pose[:3, :3], jnp.float32), jnp.asarray(pose[:3, 3], jnp.float32))
-
-
-def _polished(found: polish.Polished) -> Transform:
-    return as_transform(*jax.device_get(found.target_from_source))
+def _as_rigid(pose: Transform) -> tuple[jax.Array, jax.Array]:
+    return jnp.asarray(pose[:3, :3], jnp.float32), jnp.asarray(pose[:3, 3], jnp.float32)
 
 
 def as_transform(rotation: Float[np.ndarray, "3 3"], translation) -> Transform:

@@ -29,12 +29,11 @@ def alignment_page(
     ``names`` are the clouds' files, ``command`` what made the alignment; both may be any text.
     """
     view = look(alignment, source, target)
-    verdict = verdict_of(alignment)
     return page(
-        f"{names[0]} onto {names[1]}: {verdict}",
+        f"{names[0]} onto {names[1]}: {alignment.verdict}",
         tag(
             "header",
-            tag("h1", verdict[0].upper() + verdict[1:]),
+            tag("h1", alignment.verdict.capitalize()),
             tag("p", alignment.reason or f"{names[0]} was brought onto {names[1]}."),
             css="good" if alignment.valid else "bad",
         ),
@@ -51,11 +50,6 @@ def alignment_page(
         ),
         card("Command", tag("pre", command, css="wrap")) if command else "",
     )
-
-
-def verdict_of(alignment: Alignment) -> str:
-    """In a few words whether to trust the pose."""
-    return "aligned" if alignment.valid else "not aligned with confidence"
 
 
 def _tiles(alignment: Alignment) -> Markup:

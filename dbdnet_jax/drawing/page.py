@@ -4,6 +4,8 @@ import html
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
+from dbdnet_jax.drawing.style import BAD, GOOD, NEUTRAL
+
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
@@ -11,6 +13,7 @@ if TYPE_CHECKING:
 POLICY = (
     "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
 )
+COLOURS = f":root {{ --good: {GOOD}; --bad: {BAD}; --neutral: {NEUTRAL}; }}"
 STYLE = """
 html { color-scheme: light; overflow-y: scroll; }
 * { box-sizing: border-box; }
@@ -19,8 +22,8 @@ main { max-width: 1240px; margin: 0 auto; padding: 24px 16px 48px; }
 h1 { margin: 0; font-size: 1.7rem; line-height: 1.25; overflow-wrap: anywhere; }
 h2 { margin: 0 0 4px; font-size: 1.1rem; }
 p { margin: 0 0 8px; overflow-wrap: anywhere; }
-.good { border-left: 6px solid #009E73; padding-left: 14px; }
-.bad { border-left: 6px solid #D55E00; padding-left: 14px; }
+.good { border-left: 6px solid var(--good); padding-left: 14px; }
+.bad { border-left: 6px solid var(--bad); padding-left: 14px; }
 .tiles, .grid { display: grid; gap: 16px; margin: 16px 0; }
 .tiles { grid-template-columns: repeat(auto-fit, minmax(min(100%, 170px), 1fr)); }
 .grid { grid-template-columns: repeat(auto-fill, minmax(min(100%, 480px), 1fr)); }
@@ -37,7 +40,7 @@ pre.wrap { white-space: pre-wrap; overflow-wrap: anywhere; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-size: .875rem; font-variant-numeric: tabular-nums; }
 th, td { padding: 4px 14px 4px 0; text-align: right; vertical-align: bottom; white-space: nowrap; }
-th { font-weight: 600; white-space: pre; border-bottom: 1px solid #9aa5ae; }
+th { font-weight: 600; white-space: pre; border-bottom: 1px solid var(--neutral); }
 th:first-child, td:first-child { text-align: left; }
 table.names :is(th, td) { text-align: left; vertical-align: top; }
 .names td:nth-child(2) { overflow-wrap: anywhere; white-space: normal; min-width: 9em; }
@@ -101,7 +104,7 @@ def page(title: str, *parts: str) -> bytes:
             f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">',
             '<meta name="viewport" content="width=device-width, initial-scale=1">',
             tag("title", title),
-            f"<style>{STYLE}</style>\n<script>{get_plotlyjs()}</script>\n</head>\n<body>",
+            f"<style>{COLOURS}{STYLE}</style>\n<script>{get_plotlyjs()}</script>\n</head>\n<body>",
             tag("main", *parts),
             "</body>\n</html>\n",
         ]

@@ -7,7 +7,6 @@ import numpy as np
 from jaxtyping import Float
 
 from dbdnet_jax.align import Alignment
-from dbdnet_jax.drawing.alignment_page import verdict_of
 from dbdnet_jax.drawing.style import BAD, GOOD, OVERLAP, SOURCE, TARGET
 from dbdnet_jax.drawing.view import box, look
 
@@ -68,7 +67,7 @@ def _words(figure: Any, alignment: Alignment, names: tuple[str, str]) -> None:
     """Verdict, files and the numbers to look at first; nothing in a name is a formula."""
     words: dict[str, Any] = {"x": 0.02, "parse_math": False}
     colour = GOOD if alignment.valid else BAD
-    verdict = verdict_of(alignment).capitalize()
+    verdict = alignment.verdict.capitalize()
     figure.text(y=0.93, s=verdict, size=18, weight="bold", color=colour, **words)
     numbers = (
         " onto ".join(_shortened(name) for name in names),
