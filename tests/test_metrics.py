@@ -126,7 +126,7 @@ def test_summary_against_numpy_on_known_errors():
         "median_rotation_deg": 7.0,
         "median_translation": 0.125,
         "recall_5deg_0p1": 1 / 4,
-        "recall_15deg_30cm": 2 / 4,
+        "recall_15deg_0p3": 2 / 4,
     }
     for name, value in expected.items():
         assert_close(getattr(summary, name), np.asarray(value), DEGREES)
