@@ -132,9 +132,14 @@ def align(
 def _elect(starts: list[Transform], scene: Scene, refine: bool) -> Transform:
     """The pose that fits best; if asked for, refined on few points, then on all that are kept."""
     clouds = scene.source.sparse, scene.target.sparse
-    poses = [search.explore(pose, *clouds) for pose in starts] if refine else starts
-    best = min(poses, key=lambda pose: search.misfit(pose, *clouds))
-    return search.refine(best, scene.source.dense, scene.target.dense) if refine else best
+    if refine:
+        best, _ = min(
+            (search.explore(pose, *clouds) for pose in starts), key=lambda found: found[1]
+        )
+        return search.refine(best, scene.source.dense, scene.target.dense)
+    if len(starts) == 1:
+        return starts[0]
+    return min(starts, key=lambda pose: search.misfit(pose, *clouds))
 
 
 def _report(

@@ -28,7 +28,7 @@ ITERATIONS = 30
 ISOTROPY = 0.1  # weight of the distance in all directions, beside 1 along each normal
 OUTLIER_MASS = 1.0  # a point is half matched when the kernel's sum over the other cloud is this
 NEIGHBOURS = 12  # of a point, for its normal
-CAP = 0.05  # of the residual: farther points count as if they were this far
+CAP = 0.05  # of the residual: farther points count as if they were this far; more for sparse clouds
 SLACK = 0.02  # a refined pose may fit worse by this part: the right one of disjoint draws does
 MARGIN = 0.03  # a turned pose must fit better by this part
 NEAR_DEG = (-30.0, 30.0)  # turns that may lead out of a local minimum
@@ -36,7 +36,10 @@ MOST_POINTS = 1024  # of a cloud: the lengths above suit this density
 
 
 class Polished(NamedTuple):
-    """The refined motion, its residual (a length, see `residual`), and if it replaced the given."""
+    """The refined motion, its residual (a length), and whether it replaced what it started from.
+
+    That may be a turn of the given pose, see `explore`.
+    """
 
     target_from_source: Rigid
     residual: Float[Array, ""]
@@ -56,18 +59,27 @@ class _Scene(NamedTuple):
 
 @partial(jax.jit, static_argnames="iterations")
 def polish(
-    source: Cloud, target: Cloud, initial: Rigid, *, iterations: int = ITERATIONS
+    source: Cloud,
+    target: Cloud,
+    initial: Rigid,
+    cap: float | Float[Array, ""] = CAP,
+    *,
+    iterations: int = ITERATIONS,
 ) -> Polished:
-    """Refine ``initial`` (target_from_source), or keep it where the result fits clearly worse.
+    """Refine ``initial`` (target_from_source), or keep it where the `residual` rises by over 2 %.
 
     Pure, of fixed cost, and without a gradient of use.
     """
-    return _polish(_prepare(source, target), initial, iterations)
+    return _polish(_prepare(source, target), initial, cap, iterations)
 
 
 @partial(jax.jit, static_argnames="angles_deg")
 def polish_turns(
-    source: Cloud, target: Cloud, initial: Rigid, angles_deg: tuple[float, ...]
+    source: Cloud,
+    target: Cloud,
+    initial: Rigid,
+    angles_deg: tuple[float, ...],
+    cap: float | Float[Array, ""] = CAP,
 ) -> Polished:
     """Refine a pose and its turns about the principal axes through the moved source's middle.
 
@@ -75,29 +87,33 @@ def polish_turns(
     """
     scene = _prepare(source, target)
     starts = _turned(scene.views[0], initial, angles_deg)
-    return jax.lax.map(lambda start: _polish(scene, start, ITERATIONS), starts)
+    return jax.lax.map(lambda start: _polish(scene, start, cap, ITERATIONS), starts)
 
 
 @jax.jit
-def explore(source: Cloud, target: Cloud, initial: Rigid) -> Polished:
+def explore(
+    source: Cloud, target: Cloud, initial: Rigid, cap: float | Float[Array, ""] = CAP
+) -> Polished:
     """The refined pose, or a refined turn of it by 30 degrees that fits clearly better.
 
     Slightly better is no reason: a wrong pose that lays more of the clouds over each other may
     fit as well as the right one.
     """
-    found = polish_turns(source, target, initial, NEAR_DEG)
+    found = polish_turns(source, target, initial, NEAR_DEG, cap)
     best = jnp.argmin(found.residual.at[0].multiply(1.0 - MARGIN))
     return jax.tree.map(lambda leaf: leaf[best], found)
 
 
 @jax.jit
-def residual(source: Cloud, target: Cloud, target_from_source: Rigid) -> Float[Array, ""]:
+def residual(
+    source: Cloud, target: Cloud, target_from_source: Rigid, cap: float | Float[Array, ""] = CAP
+) -> Float[Array, ""]:
     """How badly a pose fits: root mean square distance of each cloud's points to the other cloud.
 
-    Distances above 0.05 count as 0.05, so points without a counterpart say little: 0 is a perfect
-    fit of everything, 0.05 none.
+    Distances above ``cap`` count as it, so points without a counterpart say little: 0 is a perfect
+    fit of everything, ``cap`` none. It should exceed the distance between neighbours.
     """
-    return _residual((_thin(source), _thin(target)), target_from_source)
+    return _residual((_thin(source), _thin(target)), target_from_source, cap)
 
 
 def _prepare(source: Cloud, target: Cloud) -> _Scene:
@@ -111,14 +127,16 @@ def _prepare(source: Cloud, target: Cloud) -> _Scene:
 def _thin(cloud: Cloud) -> Cloud:
     """At most MOST_POINTS rows, evenly over the valid ones; padding becomes zeros."""
     size = min(cloud.points.shape[0], MOST_POINTS)
-    rows = jnp.arange(size) * jnp.maximum(cloud.count, size) // size
+    whole, part = jnp.divmod(jnp.maximum(cloud.count, size), size)
+    rows = jnp.arange(size) * whole + jnp.arange(size) * part // size  # no overflow at 10 million
     count = jnp.minimum(cloud.count, size)
     return Cloud(jnp.where(prefix_mask(size, count)[:, None], cloud.points[rows], 0.0), count)
 
 
 def _middle(points: Float[Array, "n 3"], cloud: Cloud) -> Float[Array, "3"]:
     """The mean of the valid rows of ``points``."""
-    return _valid(cloud) @ points / jnp.maximum(cloud.count, 1)
+    total = jnp.sum(jnp.where(_valid(cloud)[:, None], points, 0.0), axis=0)
+    return total / jnp.maximum(cloud.count, 1)
 
 
 def _turned(source: Cloud, pose: Rigid, angles_deg: tuple[float, ...]) -> Rigid:
@@ -130,28 +148,38 @@ def _turned(source: Cloud, pose: Rigid, angles_deg: tuple[float, ...]) -> Rigid:
     angles = jnp.deg2rad(jnp.array(angles_deg, moved.dtype))
     turns = jax.vmap(jax.vmap(rigid.rotation_about, (None, 0)), (0, None))(axes, angles)
     turns = jnp.concatenate([jnp.eye(3)[None], turns.reshape(-1, 3, 3)])
-    about = jax.vmap(lambda turn: Rigid(turn, middle - turn @ middle))(turns)
-    return jax.vmap(rigid.compose, (0, None))(about, pose)
+    there, back = Rigid(jnp.eye(3), -middle), Rigid(jnp.eye(3), middle)
+    level = rigid.compose(there, pose)
+
+    def about_middle(turn):
+        return rigid.compose(back, rigid.compose(Rigid(turn, jnp.zeros(3)), level))
+
+    return jax.vmap(about_middle)(turns)
 
 
-def _polish(scene: _Scene, initial: Rigid, iterations: int) -> Polished:
+def _polish(
+    scene: _Scene, initial: Rigid, cap: float | Float[Array, ""], iterations: int
+) -> Polished:
     start = Rigid(initial.rotation, initial.translation - scene.centre)
     radii = jnp.geomspace(FIRST_RADIUS, LAST_RADIUS, iterations)
     end = jax.lax.scan(lambda at, radius: (_step(scene, at, radius), None), start, radii)[0]
-    before, after = _residual(scene.views, start), _residual(scene.views, end)
+    before, after = (_residual(scene.views, pose, cap) for pose in (start, end))
     accepted = after <= (1.0 + SLACK) * before
     best = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), end, start)
     motion = Rigid(best.rotation, best.translation + scene.centre)
     return Polished(motion, jnp.where(accepted, after, before), accepted)
 
 
-def _residual(views: tuple[Cloud, Cloud], motion: Rigid) -> Float[Array, ""]:
+def _residual(
+    views: tuple[Cloud, Cloud], motion: Rigid, cap: float | Float[Array, ""]
+) -> Float[Array, ""]:
     source, target = views
     squares = squared_distances(rigid.apply(motion, source.points), target.points)
     rows, columns = _valid(source), _valid(target)
     squares = jnp.where(rows[:, None] & columns[None, :], squares, jnp.inf)
-    squares = jnp.minimum(squares, CAP**2)
-    total = rows @ squares.min(axis=1) + columns @ squares.min(axis=0)
+    squares = jnp.minimum(squares, jnp.square(cap))
+    ways = jnp.where(rows, squares.min(axis=1), 0.0), jnp.where(columns, squares.min(axis=0), 0.0)
+    total = sum(jnp.sum(way) for way in ways)
     return jnp.sqrt(total / jnp.maximum(source.count + target.count, 1))
 
 

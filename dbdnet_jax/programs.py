@@ -34,7 +34,12 @@ def load_or_trace(function: Callable, name: str, *arguments) -> Callable:
     if folder is None:
         return jax.jit(function)
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), arguments)
-    identity = repr((name, shapes, jax.__version__, jax.default_backend(), _source_hash()))
+    precision = (
+        jax.config.values["jax_enable_x64"],
+        jax.config.values["jax_default_matmul_precision"],
+    )
+    built = jax.__version__, jax.default_backend(), precision, _source_hash()
+    identity = repr((name, shapes, *built))
     path = Path(folder) / f"{hashlib.sha256(identity.encode()).hexdigest()[:32]}.stablehlo"
     try:
         exported = export.deserialize(bytearray(path.read_bytes()))

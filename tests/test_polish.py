@@ -95,6 +95,15 @@ def test_a_result_that_fits_worse_is_rejected(crops, monkeypatch):
     assert_close(found.residual, residual(*crops, start), FLOAT32)
 
 
+@pytest.mark.parametrize(("worse", "accepted"), [(1.01, True), (1.04, False)])
+def test_a_pose_may_fit_worse_by_two_percent(crops, monkeypatch, worse, accepted):
+    """The right pose of disjoint draws often fits a little worse than the one before."""
+    values = iter((0.03, 0.03 * worse))
+    monkeypatch.setattr(module, "_residual", lambda *_: jnp.float32(next(values)))
+    found = polish(*crops, motion(1.0), iterations=3 if accepted else 4)  # programs of their own
+    assert bool(found.accepted) is accepted
+
+
 def test_padding_changes_nothing(crops):
     start = motion(5.0, 0.02)
     longer = [cloud(np.asarray(c.points)[: int(c.count)], 2 * SIZE) for c in crops]
@@ -117,24 +126,25 @@ def test_turns_are_polished_each_for_itself(crops):
     """About the principal axes through the middle of the moved source, the pose itself first."""
     source, target = crops
     pose = motion(6.0, 0.02)
-    found = polish_turns(source, target, pose, (-40.0, 40.0))
+    found = polish_turns(source, target, pose, (-120.0, 120.0))
     moved = np.float64(source.points[: int(source.count)]) @ np.float64(pose.rotation).T + 0.02
     middle = moved.mean(axis=0)
-    turns = [np.eye(3)]
-    for axis in np.linalg.svd(moved - middle)[2][::-1]:
-        turns += [Rotation.from_rotvec(x * axis, degrees=True).as_matrix() for x in (-40, 40)]
-    starts = [
-        Rigid(turn @ pose.rotation, middle + turn @ (pose.translation - middle)) for turn in turns
-    ]
-    expected = [polish(source, target, jax.tree.map(jnp.float32, start)) for start in starts]
-    assert_close(found.residual[0], expected[0].residual, FLOAT32)
-    # An axis may point either way, so the two turns about it may change places.
-    for k in (1, 3, 5):
-        pairs = (
-            np.sort(found.residual[k : k + 2]),
-            np.sort([x.residual for x in expected[k : k + 2]]),
-        )
-        assert_close(pairs[0], pairs[1], Tolerance(rtol=0.02, atol=0.0))
+    for k, axis in enumerate(np.linalg.svd(moved - middle)[2][::-1]):
+        ends = []
+        for degrees in (-120, 120):
+            turn = Rotation.from_rotvec(degrees * axis, degrees=True).as_matrix()
+            start = Rigid(turn @ pose.rotation, middle + turn @ (pose.translation - middle))
+            ends.append(polish(source, target, jax.tree.map(jnp.float32, start)))
+        # An axis may point either way, so the two turns about it may change places.
+        rows = [1 + 2 * k, 2 + 2 * k]
+        if abs(float(found.residual[rows[0]] - ends[0].residual)) > 1e-5:
+            rows.reverse()
+        for row, end in zip(rows, ends, strict=True):
+            here = jax.tree.map(lambda leaf, row=row: leaf[row], found.target_from_source)
+            assert_close(here.rotation, end.target_from_source.rotation, Tolerance(0.0, 0.02))
+            assert_close(here.translation, end.target_from_source.translation, Tolerance(0.0, 0.02))
+    own = polish(source, target, pose)
+    assert_close(found.target_from_source.rotation[0], own.target_from_source.rotation, PADDING)
 
 
 def test_explore_leaves_a_local_minimum_and_trusts_the_first(crops, monkeypatch):
@@ -167,7 +177,7 @@ def test_clouds_of_little_use_keep_the_pose_finite(degenerate):
     start = motion(10.0, 0.1)
     for other in (degenerate, degenerate + 9.0, degenerate[:1]):
         found = polish(cloud(degenerate), cloud(other), start)
-        assert_finite(found)
+        assert_finite((found, explore(cloud(degenerate), cloud(other), start)))
         rotation = np.asarray(found.target_from_source.rotation)
         assert_close(rotation @ rotation.T, np.eye(3), Tolerance(0.0, SMALL))
     nothing = cloud(np.zeros((0, 3)))

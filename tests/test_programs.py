@@ -13,7 +13,9 @@ from dbdnet_jax.polish import Polished
 from dbdnet_jax.types import Branch, Registration, Rigid
 from tests.aligning import tiny_params
 from tests.conftest import random_cloud
+from tests.test_structure import imported_names
 
+NOT_TRACED = {"programs", "files", "safe_pickle", "judging"}
 BUCKETS = {192, 384, 768, 1536}
 
 
@@ -36,9 +38,21 @@ def answer_nothing(params, source, target) -> Registration:
     )
 
 
-def test_every_file_that_a_kept_program_comes_of_is_there():
+def test_a_kept_program_depends_on_every_file_that_it_is_traced_through():
     package = Path(programs.__file__).parent
-    assert all(any(package.glob(name)) for name in programs.TRACED)
+    hashed = {path for name in programs.TRACED for path in package.glob(name)}
+    reached, waiting = set(), [package / "alignment" / "search.py"]
+    while waiting:
+        path = waiting.pop()
+        names = [name.split(".") for name in imported_names(path, package.parent)]
+        files = {
+            package.parent.joinpath(*part).with_suffix(".py") for x in names for part in (x, x[:-1])
+        }
+        found = {file for file in files - reached if file.is_file() and file.stem not in NOT_TRACED}
+        reached |= found
+        waiting += found
+    assert package / "polish.py" in reached
+    assert reached <= hashed
 
 
 def test_fifty_sizes_are_traced_as_often_as_there_are_buckets(monkeypatch):
@@ -49,7 +63,7 @@ def test_fifty_sizes_are_traced_as_often_as_there_are_buckets(monkeypatch):
         return answer_nothing(params, source, target)
 
     @jax.jit
-    def polish(source, target, start):
+    def polish(source, target, start, cap):
         polishes.append((len(source.points), len(target.points)))
         return Polished(Rigid(*start), jnp.zeros(()), jnp.ones((), bool))
 

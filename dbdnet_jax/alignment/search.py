@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from dbdnet_jax import polish
+from dbdnet_jax.alignment.judging import inlier_distance
 from dbdnet_jax.model.dbdnet import register_clouds
 from dbdnet_jax.model.params import Params
 from dbdnet_jax.programs import load_or_trace
@@ -19,11 +20,8 @@ OtherPoints = Float[np.ndarray, "m 3"]
 Transform = Float[np.ndarray, "4 4"]
 
 SMALLEST_BUCKET = 192
-FAR_DEG = (
-    90.0,
-    180.0,
-    270.0,
-)  # turns of symmetric shapes: they tell of doubt, and are not followed
+FAR_DEG = (90.0, 180.0, 270.0)  # turns of symmetric shapes tell of doubt, and are not followed
+CAP_PER_DISTANCE = 0.7  # the cap of residuals, per distance of inliers
 DIFFERENT_DEG = 15.0  # from the pose, of what counts as a rival
 NO_RIVAL = 3.0  # the margin where there is none
 CROWD_MARGIN = 0.5  # a rival whose misfit is larger by this logarithm counts as 1/e of one
@@ -46,7 +44,8 @@ class Proposal(NamedTuple):
 class Rival(NamedTuple):
     """The best other pose: how it differs, and the logarithm of its misfit per that of the pose.
 
-    ``crowd`` is the number of all rivals, each counted by ``exp(-margin / 0.5)``.
+    ``crowd`` counts the turns that end in another pose: one that fits as well or better as 1, the
+    others as ``exp(-margin / 0.5)``.
     """
 
     angle_deg: float
@@ -91,55 +90,71 @@ def ask_network(params: Params, source: Points, target: OtherPoints) -> Proposal
 
 def refine(pose: Transform, source: Points, target: OtherPoints) -> Transform:
     """The pose after `polish` on an even part of the clouds."""
-    clouds = [points[:: -(-len(points) // polish.MOST_POINTS)] for points in (source, target)]
-    rotation, translation, _ = _run_polish(polish.polish, pose, *clouds)
+    rotation, translation, *_ = _run_polish(polish.polish, pose, _even(source), _even(target))
     return as_transform(rotation, translation)
 
 
-def explore(pose: Transform, source: Points, target: OtherPoints) -> Transform:
-    """The refined pose, or a refined neighbour of it that fits clearly better."""
-    rotation, translation, _ = _run_polish(polish.explore, pose, source, target)
-    return as_transform(rotation, translation)
+def _even(points: Points) -> Float[np.ndarray, "k 3"]:
+    """As many points as `polish` takes, evenly chosen."""
+    size = min(len(points), polish.MOST_POINTS)
+    return points[np.arange(size) * len(points) // size]
+
+
+def explore(pose: Transform, source: Points, target: OtherPoints) -> tuple[Transform, float]:
+    """The refined pose, or a refined neighbour of it that fits clearly better; and its misfit."""
+    rotation, translation, residual, _ = _run_polish(polish.explore, pose, source, target)
+    return as_transform(rotation, translation), float(residual)
 
 
 def misfit(pose: Transform, source: Points, target: OtherPoints) -> float:
     """How badly a pose fits: the `residual`, a length."""
-    clouds = (Cloud(*cloud) for cloud in _pad(source, target))
-    return float(polish.residual(*clouds, Rigid(*_as_rigid(pose))))
+    return float(_run_polish(polish.residual, pose, source, target)[0])
 
 
 def best_rival(pose: Transform, source: Points, target: OtherPoints) -> Rival:
     """The best other pose among the refined turns of this one.
 
-    A turn that falls back to the pose itself is no rival.
+    A turn that falls back to the pose itself, or to what refining would make of it, is no rival.
     """
-    *motions, residuals = _run_polish(_all_turns, pose, source, target)
-    squares = (residuals / polish.CAP) ** 2 + 1e-3
-    margins = np.log(squares / squares[0])
+    *motions, residuals, _, own = _run_polish(_all_turns, pose, source, target)
+    cap = _cap(source, target)
+    margins = np.log(((residuals / cap) ** 2 + 1e-3) / ((own / cap) ** 2 + 1e-3))
     others = [as_transform(*motion) for motion in zip(*motions, strict=True)]
     angles, axes = zip(*(angle_between(other, pose) for other in others), strict=True)
-    rivals = np.flatnonzero(np.array(angles) > DIFFERENT_DEG)
+    apart = [angle_between(other, others[0])[0] for other in others]
+    rivals = np.flatnonzero(np.minimum(angles, apart) > DIFFERENT_DEG)
     if not rivals.size:
         return Rival(180.0, np.eye(3)[0], NO_RIVAL, 0.0)
     best = rivals[np.argmin(margins[rivals])]
-    crowd = np.exp(-margins[rivals] / CROWD_MARGIN).sum()
+    crowd = np.exp(-np.maximum(margins[rivals], 0.0) / CROWD_MARGIN).sum()
     return Rival(angles[best], axes[best], min(float(margins[best]), NO_RIVAL), float(crowd))
 
 
-def _all_turns(source: Cloud, target: Cloud, pose: Rigid) -> polish.Polished:
-    return polish.polish_turns(source, target, pose, polish.NEAR_DEG + FAR_DEG)
+def _all_turns(
+    source: Cloud, target: Cloud, pose: Rigid, cap: jax.Array
+) -> tuple[polish.Polished, jax.Array]:
+    """The pose and its turns refined, and the residual of the pose as it is."""
+    turns = polish.NEAR_DEG + FAR_DEG
+    found = polish.polish_turns(source, target, pose, turns, cap)
+    return found, polish.residual(source, target, pose, cap)
 
 
 def _run_polish(
     function: Callable, pose: Transform, source: Points, target: OtherPoints
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rotation, translation and residual that a function of `polish` finds from the pose."""
+) -> list[np.ndarray]:
+    """The arrays that a function of `polish` gives for the pose."""
 
-    def arrays(source, target, start):
-        found = function(Cloud(*source), Cloud(*target), Rigid(*start))
-        return *found.target_from_source, found.residual
+    def arrays(source, target, start, cap):
+        return tuple(jax.tree.leaves(function(Cloud(*source), Cloud(*target), Rigid(*start), cap)))
 
-    return _run(function.__name__, arrays, *_pad(source, target), _as_rigid(pose))
+    start = tuple(jnp.asarray(part, jnp.float32) for part in (pose[:3, :3], pose[:3, 3]))
+    cap = jnp.asarray(_cap(source, target), jnp.float32)
+    return list(_run(function.__name__, arrays, *_pad(source, target), start, cap))
+
+
+def _cap(source: Points, target: OtherPoints) -> float:
+    """Of residuals: more than the spacing of the points, which of sparse clouds is wide."""
+    return max(polish.CAP, CAP_PER_DISTANCE * inlier_distance(source, target))
 
 
 def _run(name: str, function: Callable, *arguments: Any) -> Any:
@@ -159,10 +174,6 @@ def _pad(*clouds: np.ndarray) -> Iterator[tuple[jax.Array, jax.Array]]:
         padded = np.zeros((size, 3), np.float32)
         padded[: len(points)] = points
         yield jnp.asarray(padded), jnp.asarray(len(points))
-
-
-def _as_rigid(pose: Transform) -> tuple[jax.Array, jax.Array]:
-    return jnp.asarray(pose[:3, :3], jnp.float32), jnp.asarray(pose[:3, 3], jnp.float32)
 
 
 def as_transform(rotation: Float[np.ndarray, "3 3"], translation) -> Transform:

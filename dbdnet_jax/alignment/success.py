@@ -30,7 +30,7 @@ class Evidence(NamedTuple):
     stiffness: float  # logarithm of the least held motion's stiffness
     correction: float  # logarithm of 1 + degrees between the network's pose and the refined one
     rival: float  # logarithm of the best rival pose's misfit per this one's misfit
-    crowd: float  # how many poses fit about as well
+    crowd: float  # how many turns of the pose end in another one that fits about as well
 
 
 def gather(
