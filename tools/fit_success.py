@@ -1,7 +1,7 @@
 """Fit the success probability of `align` on validation pairs, and show how far to trust it.
 
     python -m tools.fit_success --params=cad
-    python -m tools.fit_success --params=cad --check   # only measure, on the frozen test pairs
+    python -m tools.fit_success --params=cad --check   # only measure, on 3 x 200 frozen test pairs
 
 Writes the coefficients beside the weights. The figures printed for the fit are of five folds by
 shape: no pair is judged by coefficients that have seen its shape.
@@ -36,6 +36,8 @@ from dbdnet_jax.model.params import Params
 from dbdnet_jax.types import Pair
 from dbdnet_jax.weights import load_named
 
+VARIANTS = ("noise", "clean", "disjoint")  # of the frozen test pairs, in the order of:
+TEST_PAIRS = 200
 PROTOCOLS = (Protocol(), Protocol(noise_sigma=0.0), Protocol(disjoint=True))
 SEED = 77
 ALIGN = importlib.import_module("dbdnet_jax.align")  # not the function of that name
@@ -58,10 +60,10 @@ _draw = {
 }
 
 
-def test_pairs() -> Iterator[tuple[int, Pair]]:
-    """The frozen test pairs with noise."""
-    pairs, _ = cad_test_pairs("noise")
-    for i in range(len(pairs.source.count)):
+def test_pairs(variant: str) -> Iterator[tuple[int, Pair]]:
+    """The frozen test pairs of one variant."""
+    pairs, _ = cad_test_pairs(variant)
+    for i in range(TEST_PAIRS):
         yield i, jax.tree.map(lambda leaf: leaf[i], pairs)  # noqa: B023
 
 
@@ -151,9 +153,16 @@ def main() -> None:
     options = parser.parse_args()
     params = load_named(options.params)
     if options.check:
-        evidence, success, _, _ = examine(params, test_pairs(), 200)
         held = load_coefficients(options.output)
-        show(np.array([probability_of(Evidence(*row), held) for row in evidence]), success)
+        found = []
+        for variant in VARIANTS:
+            evidence, success, _, _ = examine(params, test_pairs(variant), TEST_PAIRS)
+            probability = np.array([probability_of(Evidence(*row), held) for row in evidence])
+            print(f"\n{variant}:")
+            show(probability, success)
+            found.append((probability, success))
+        print("\ntogether:")
+        show(*map(np.concatenate, zip(*found, strict=True)))
         return
     evidence, success, shapes, errors = examine(
         params, validation_pairs(options.pairs), options.pairs
