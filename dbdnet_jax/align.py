@@ -149,7 +149,7 @@ def _report(
     clouds = scene.source.sparse, scene.target.sparse
     judgement = judge(search.move(pose, scene.source.dense), scene.target.dense, distance)
     rival = search.best_rival(pose, *clouds)
-    evidence = gather(proposal, pose, judgement, rival, *clouds)
+    evidence = gather(proposal, pose, judgement, rival)
     probability = success_probability(evidence, load_coefficients())
     reason = doubt(scene, proposal, judgement, probability)
     laps["judge"] = time.perf_counter()

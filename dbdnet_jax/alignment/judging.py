@@ -57,13 +57,6 @@ def inlier_distance(source: Points, target: OtherPoints) -> float:
     return float(max(NEAREST_INLIER, 2 * max(spacings)))
 
 
-def near(points: Points, others: OtherPoints, distance: float) -> Bool[np.ndarray, " n"]:
-    """Which points have another cloud's point within ``distance``."""
-    from scipy.spatial import cKDTree
-
-    return np.isfinite(cKDTree(others).query(points, distance_upper_bound=distance)[0])
-
-
 def judge(moved: Points, target: OtherPoints, distance: float) -> Judgement:
     """Compare a moved source with a target; fewer than six inliers leave every motion free."""
     from scipy.spatial import cKDTree

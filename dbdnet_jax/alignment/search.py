@@ -45,13 +45,15 @@ class Rival(NamedTuple):
     """The best other pose: how it differs, and the logarithm of its misfit per that of the pose.
 
     ``crowd`` counts the turns that end in another pose: one that fits as well or better as 1, the
-    others as ``exp(-margin / 0.5)``.
+    others as ``exp(-margin / 0.5)``. ``drift_deg`` is how far refining it once more moves the pose
+    itself: little, where it is well held.
     """
 
     angle_deg: float
     axis: Float[np.ndarray, "3"]
     margin: float
     crowd: float
+    drift_deg: float
 
 
 def ask_network(params: Params, source: Points, target: OtherPoints) -> Proposal:
@@ -124,10 +126,11 @@ def best_rival(pose: Transform, source: Points, target: OtherPoints) -> Rival:
     apart = [angle_between(other, others[0])[0] for other in others]
     rivals = np.flatnonzero(np.minimum(angles, apart) > DIFFERENT_DEG)
     if not rivals.size:
-        return Rival(180.0, np.eye(3)[0], NO_RIVAL, 0.0)
+        return Rival(180.0, np.eye(3)[0], NO_RIVAL, 0.0, angles[0])
     best = rivals[np.argmin(margins[rivals])]
     crowd = np.exp(-np.maximum(margins[rivals], 0.0) / CROWD_MARGIN).sum()
-    return Rival(angles[best], axes[best], min(float(margins[best]), NO_RIVAL), float(crowd))
+    margin = min(float(margins[best]), NO_RIVAL)
+    return Rival(angles[best], axes[best], margin, float(crowd), angles[0])
 
 
 def _all_turns(

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
-from dbdnet_jax.alignment.judging import Judgement, near
-from dbdnet_jax.alignment.search import Proposal, Rival, Transform, angle_between, move
+from dbdnet_jax.alignment.judging import Judgement
+from dbdnet_jax.alignment.search import Proposal, Rival, Transform, angle_between
 from dbdnet_jax.weights import PRETRAINED
 
 SUCCESS_FILE = PRETRAINED / "cad_success.json"
@@ -23,36 +22,24 @@ SUCCESS_DEG = 5.0  # a pose is right when its rotation is off by less
 class Evidence(NamedTuple):
     """What speaks for or against a pose; every entry free of units."""
 
-    inliers: float  # part of the points of both clouds that have a counterpart
     residual: float  # distance along the normals, root mean square, per inlier distance
-    overlap: float  # mean predicted probability
-    confidence: float  # mean over the matched points
+    sureness: float  # mean distance of the overlap probabilities from one half
     stiffness: float  # logarithm of the least held motion's stiffness
     correction: float  # logarithm of 1 + degrees between the network's pose and the refined one
+    drift: float  # the same between the pose and what refining it once more makes of it
     rival: float  # logarithm of the best rival pose's misfit per this one's misfit
     crowd: float  # how many turns of the pose end in another one that fits about as well
 
 
-def gather(
-    proposal: Proposal,
-    pose: Transform,
-    judgement: Judgement,
-    rival: Rival,
-    source: Float[np.ndarray, "n 3"],
-    target: Float[np.ndarray, "m 3"],
-) -> Evidence:
-    """The evidence for a pose; the clouds are those that the network saw, at its scale."""
-    moved = move(pose, source)
-    shown = near(moved, target, judgement.distance), near(target, moved, judgement.distance)
+def gather(proposal: Proposal, pose: Transform, judgement: Judgement, rival: Rival) -> Evidence:
+    """The evidence for a pose."""
     predicted = proposal.source_overlap, proposal.target_overlap
-    kept = proposal.confidence[proposal.source_kept]
     return Evidence(
-        inliers=float(np.mean([x.mean() for x in shown])),
         residual=min(judgement.plane_rmse / judgement.distance, 1.0),
-        overlap=float(np.mean([p.mean() for p in predicted])),
-        confidence=float(kept.mean()) if kept.size else 0.0,
+        sureness=float(np.mean([np.abs(p - 0.5).mean() for p in predicted])),
         stiffness=math.log(max(judgement.stiffness, 1e-6)),
         correction=math.log1p(angle_between(pose, proposal.transform)[0]),
+        drift=math.log1p(rival.drift_deg),
         rival=rival.margin,
         crowd=rival.crowd,
     )
