@@ -81,3 +81,9 @@ def test_fifty_sizes_are_traced_as_often_as_there_are_buckets(monkeypatch):
     for traces in (networks, polishes):
         assert len(traces) == len(set(traces)) <= len(BUCKETS)
         assert {size for pair in traces for size in pair} <= BUCKETS
+
+
+def test_two_functions_of_equal_arguments_are_two_programs(monkeypatch):
+    monkeypatch.setattr(search, "_PROGRAMS", {})
+    one, two = (search._run(f"add {k}", lambda x, k=k: x + k, jnp.ones(3)) for k in (1, 2))
+    assert (two - one == 1).all()

@@ -41,15 +41,15 @@ def test_what_refining_would_make_of_a_pose_is_no_rival_of_it():
     assert rival.margin > -0.1
 
 
-@pytest.mark.parametrize(("count", "scale"), [(60, 1.0), (380, 3.0)])
-def test_the_true_pose_fits_best_in_sparse_and_in_large_clouds(count, scale):
+@pytest.mark.parametrize(("count", "scale"), [(60, 1.0), (60, 3.0), (380, 3.0)])
+def test_the_true_pose_fits_far_better_in_sparse_and_in_large_clouds_too(count, scale):
     source, target = scale * solid(count, 0), scale * solid(count, 1)
     own = search.misfit(np.eye(4), source, target)
     rng = np.random.default_rng(0)
     for _ in range(20):
         turned = search.as_transform(rng.normal(size=(3, 3)), scale * rng.normal(size=3) * 0.1)
         if search.angle_between(turned, np.eye(4))[0] > 30:
-            assert search.misfit(turned, source, target) > 1.1 * own
+            assert search.misfit(turned, source, target) > 1.25 * own
 
 
 @pytest.mark.parametrize("count", [300, 1100, 5000])
