@@ -18,7 +18,7 @@ from pathlib import Path
 from absl import app, flags, logging
 from ml_collections import config_flags
 
-from dbdnet_jax.checkpoint import STAGES, load_best
+from dbdnet_jax.checkpoint import JOINT, STAGES, load_best
 from dbdnet_jax.drawing.evaluation_page import evaluation_page
 from dbdnet_jax.evaluation import evaluate
 from dbdnet_jax.extras import MissingExtraError, require_drawing
@@ -50,7 +50,7 @@ def choose_params(params: str | None, run_dir: str | None, config_name: str) -> 
     if params is not None:
         return load_named(params)
     default = Path("runs") / config_name
-    trained = any((default / stage / "checkpoints").is_dir() for stage in STAGES)
+    trained = any((default / stage / "checkpoints").is_dir() for stage in (*STAGES, JOINT))
     if run_dir is not None or trained or not (PRETRAINED / f"{config_name}.npz").is_file():
         return load_best(run_dir or default)
     print(f"{default} holds no training; scoring the weights in the package.", file=sys.stderr)

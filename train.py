@@ -16,7 +16,7 @@ import jax
 from absl import app, flags, logging
 from ml_collections import config_flags
 
-from dbdnet_jax.checkpoint import STAGES, load_best
+from dbdnet_jax.checkpoint import JOINT, STAGES, load_best
 from dbdnet_jax.evaluation import evaluate
 from dbdnet_jax.programs import keep_compiled_programs
 from dbdnet_jax.report import render, save
@@ -27,7 +27,9 @@ from dbdnet_jax.weights import save_params
 
 CONFIG = config_flags.DEFINE_config_file("config", None, "Configuration file, configs/NAME.py.")
 RUN_DIR = flags.DEFINE_string("run_dir", None, "Where results go; runs/NAME if not given.")
-STAGE = flags.DEFINE_enum("stage", "both", [*STAGES, "both"], "What to train.")
+STAGE = flags.DEFINE_enum(
+    "stage", "both", [*STAGES, "both", JOINT], "What to train; joint goes on from both."
+)
 EVALUATE = flags.DEFINE_bool("evaluate", True, "Print the table of results at the end.")
 
 
@@ -43,7 +45,7 @@ def main(argv: list[str]) -> None:
         settings = read_settings(CONFIG.value)
         # Before anything asks JAX for a device: the number is fixed from then on. More devices
         # than pairs in a step would have nothing to do.
-        pairs = max(settings.overlap.batch_size, settings.registration.batch_size)
+        pairs = max(getattr(settings, stage).batch_size for stage in stages)
         devices = settings.train.devices or min(os.cpu_count() or 1, pairs)
         jax.config.update("jax_num_cpu_devices", devices)
         keep_compiled_programs()

@@ -48,4 +48,5 @@ def get_config() -> ConfigDict:
     config.overlap.gamma = 0.0
     config.registration.epochs = 50.0
     config.registration.masks = "imperfect"
+    config.joint.epochs = 20.0
     return config

@@ -18,7 +18,7 @@ def get_config() -> ConfigDict:
     config = ConfigDict()
     config.model = _model()
     config.data = ConfigDict(
-        {"name": "modelnet40", "folder": "", "categories": "all", "procedural": 0}
+        {"name": "modelnet40", "folder": "", "categories": "all", "procedural": 0, "varied": 0.0}
     )
     config.protocol = ConfigDict(
         {
@@ -53,6 +53,13 @@ def get_config() -> ConfigDict:
                 "translation": 1.0,
                 "distance": 1.0,
             },
+        }
+    )
+    config.joint = ConfigDict(
+        {
+            "epochs": 30.0,
+            "batch_size": train.get_oneway_ref("batch_size"),
+            "learning_rate": train.get_oneway_ref("learning_rate"),
         }
     )
     return config.lock()

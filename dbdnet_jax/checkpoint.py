@@ -1,8 +1,8 @@
 """Checkpoints of a training run: the newest two and the best one, each written as a whole.
 
-A run folder holds one folder for each stage, ``overlap`` and ``registration``; in it ``stage.json``
-says what the stage trains, and ``checkpoints/STEP`` holds a state at a step. Weights to share are
-another matter: see `dbdnet_jax.weights`.
+A run folder holds one folder for each stage (``overlap``, ``registration`` and perhaps ``joint``);
+in it ``stage.json`` says what the stage trains, and ``checkpoints/STEP`` holds a state at a step.
+Weights to share are another matter: see `dbdnet_jax.weights`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from dbdnet_jax.model.config import ModelConfig
 from dbdnet_jax.model.params import Params
 from dbdnet_jax.safe_pickle import CheckpointError
 
-STAGES = ("overlap", "registration")
+STAGES = ("overlap", "registration")  # named as the networks they train
+JOINT = "joint"  # both networks, further
 KEPT = 2  # newest checkpoints; the second survives when the first is damaged
 
 State = TypeVar("State")
@@ -159,22 +160,25 @@ def read_stage(folder: Path) -> dict[str, Any]:
         ) from error
 
 
-def load_best(run_dir: str | Path) -> Params:
+def load_best(run_dir: str | Path, *, joint: bool = True) -> Params:
     """The best weights of a run: of each stage that was trained, the smallest validation error.
+
+    Those of the joint stage where it has any, unless ``joint`` is False.
 
     Raises:
         CheckpointError: no stage has a validated checkpoint, or one is damaged.
     """
     weights: dict[str, Any] = dict.fromkeys(STAGES)
     model = None
-    for stage in STAGES:
+    for stage in (*STAGES, JOINT) if joint else STAGES:
         folder = Path(run_dir) / stage
         if not (folder / "checkpoints").is_dir():
             continue
         with Checkpoints(folder) as checkpoints:
             step = checkpoints.best_step()
             if step is not None:
-                weights[stage] = checkpoints.restore_weights(step)
+                found = checkpoints.restore_weights(step)
+                weights |= found if stage == JOINT else {stage: found}
                 model = _model_config(folder)
     if model is None:
         raise CheckpointError(

@@ -52,6 +52,18 @@ class RegistrationTerms(NamedTuple):
     distance: Float[Array, ""]
 
 
+class JointTerms(NamedTuple):
+    """The terms of both losses together; the loss is their sum."""
+
+    source_focal: Float[Array, ""]
+    target_focal: Float[Array, ""]
+    matching: Float[Array, ""]
+    correspondence: Float[Array, ""]
+    rotation: Float[Array, ""]
+    translation: Float[Array, ""]
+    distance: Float[Array, ""]
+
+
 def focal_loss(
     probability: Float[Array, " n"],
     label: Bool[Array, " n"],

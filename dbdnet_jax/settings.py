@@ -29,6 +29,7 @@ class DataSettings:
     procedural: int = (
         0  # generated shapes to train on beside those of "cad": 15 ms each, every start
     )
+    varied: float = 0.0  # share of the training pairs under other conditions than the protocol's
 
     def __post_init__(self):
         """Refuse an unknown data set."""
@@ -40,6 +41,11 @@ class DataSettings:
             raise ValueError(
                 "config.data.procedural must not be negative, and 0 for other data than 'cad'; got "
                 f"{self.procedural} for {self.name!r}. Use 0."
+            )
+        if not 0 <= self.varied <= 1 or (self.varied and self.name == "threedmatch"):
+            raise ValueError(
+                "config.data.varied must be in [0, 1], and 0 for 'threedmatch', whose pairs are "
+                f"read; got {self.varied} for {self.name!r}. Use 0."
             )
 
 
@@ -117,6 +123,22 @@ class RegistrationSettings:
 
 
 @dataclasses.dataclass(frozen=True)
+class JointSettings:
+    """Both networks trained further together, each on what the other one makes of the pair.
+
+    The loss is the sum of both stages' losses, with their gamma and weights.
+    """
+
+    epochs: float
+    batch_size: int
+    learning_rate: float
+
+    def __post_init__(self):
+        """Refuse a stage of nothing."""
+        _check_stage("joint", self)
+
+
+@dataclasses.dataclass(frozen=True)
 class Settings:
     """All of a configuration."""
 
@@ -126,6 +148,7 @@ class Settings:
     train: TrainSettings
     overlap: OverlapSettings
     registration: RegistrationSettings
+    joint: JointSettings
 
 
 def read_settings(config: ConfigDict) -> Settings:
@@ -174,10 +197,11 @@ def stage_record(settings: Settings, stage: str) -> dict[str, Any]:
     record = dataclasses.asdict(settings)
     for name in ("devices", "batch_size", "learning_rate"):  # the stage holds the last two
         del record["train"][name]
-    return {name: record[name] for name in ("model", "data", "protocol", "train", stage)}
+    parts = ("overlap", "registration", "joint") if stage == "joint" else (stage,)
+    return {name: record[name] for name in ("model", "data", "protocol", "train", *parts)}
 
 
-def _check_stage(name: str, stage: OverlapSettings | RegistrationSettings) -> None:
+def _check_stage(name: str, stage: OverlapSettings | RegistrationSettings | JointSettings) -> None:
     if stage.epochs <= 0 or stage.batch_size < 1:
         raise ValueError(
             f"config.{name} must have epochs > 0 and batch_size >= 1; got epochs={stage.epochs}, "

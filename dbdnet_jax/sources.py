@@ -20,6 +20,7 @@ from dbdnet_jax.data.modelnet40 import load_modelnet40
 from dbdnet_jax.data.pairs import Protocol, make_pair
 from dbdnet_jax.data.procedural import procedural_shapes
 from dbdnet_jax.data.shapes import Shapes, joined, select
+from dbdnet_jax.data.varied import make_varied_pair
 from dbdnet_jax.files import cache_folder
 from dbdnet_jax.settings import DataSettings, Settings
 from dbdnet_jax.types import Pair
@@ -62,6 +63,7 @@ def load_source(settings: Settings, batch_size: int) -> Source:
         settings.protocol,
         seed=settings.train.seed,
         validation_pairs=settings.train.validation_pairs,
+        varied=settings.data.varied,
     )
 
 
@@ -82,9 +84,17 @@ def load_training_shapes(data: DataSettings) -> tuple[Shapes, Shapes]:
 
 
 def shape_source(
-    train: Shapes, validation: Shapes, protocol: Protocol, *, seed: int, validation_pairs: int
+    train: Shapes,
+    validation: Shapes,
+    protocol: Protocol,
+    *,
+    seed: int,
+    validation_pairs: int,
+    varied: float = 0.0,
 ) -> Source:
     """Pairs drawn on the device; every epoch sees every shape once, in an order of its own.
+
+    Of the training pairs a share of ``varied`` is drawn by `make_varied_pair`.
 
     Raises:
         ValueError: no shape to train or to validate on.
@@ -100,7 +110,15 @@ def shape_source(
     def draw(key: PRNGKeyArray, number: Int[Array, ""], points: Any) -> Pair:
         order = jax.random.permutation(jax.random.fold_in(order_key, number // count), count)
         shape = points[order[number % count]]
-        return make_pair(key, shape, jnp.zeros_like(shape), protocol)  # nothing trains on normals
+        normals = jnp.zeros_like(shape)  # nothing trains on them
+        if not varied:
+            return make_pair(key, shape, normals, protocol)
+        choice_key, key = jax.random.split(key)
+        return jax.lax.cond(
+            jax.random.uniform(choice_key) < varied,
+            lambda: make_varied_pair(key, shape, normals, protocol),
+            lambda: make_pair(key, shape, normals, protocol),
+        )
 
     return Source(
         epoch_pairs=count,

@@ -1,7 +1,8 @@
-"""The two stages of training: what each one trains, behind what, and how it is judged.
+"""The stages of training: what each one trains, behind what, and how it is judged.
 
 "overlap" trains the overlap network; "registration" trains the registration network behind it,
-frozen and deterministic (the released code leaves the frozen network's dropout on).
+frozen and deterministic (the released code leaves the frozen network's dropout on). "joint", which
+the paper does not have, then trains both on what they make of a pair together.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from dbdnet_jax.checkpoint import load_best
+from dbdnet_jax.checkpoint import JOINT, STAGES, load_best
 from dbdnet_jax.data.pairs import imperfect_overlap, moved_pair, starting_motion
-from dbdnet_jax.losses import overlap_loss, registration_loss
+from dbdnet_jax.losses import JointTerms, overlap_loss, registration_loss
 from dbdnet_jax.metrics import pair_confusion, registration_errors
 from dbdnet_jax.model.config import ModelConfig
 from dbdnet_jax.model.dbdnet import (
@@ -32,9 +33,10 @@ from dbdnet_jax.model.params import (
     parameter_shapes,
     require_shapes,
 )
+from dbdnet_jax.ops import rigid
 from dbdnet_jax.safe_pickle import CheckpointError
 from dbdnet_jax.settings import Settings
-from dbdnet_jax.types import Pair
+from dbdnet_jax.types import Pair, Registration, Rigid
 from dbdnet_jax.weights import load_params
 
 # (trainable, frozen, pair, key) -> (loss, NamedTuple of its terms)
@@ -44,21 +46,29 @@ Validation = Callable[[Any, Any, Pair], dict[str, Float[Array, ""]]]
 
 
 class Task(NamedTuple):
-    """One stage: the parameters it trains and those it leaves alone, its loss, its judge."""
+    """One stage: the parameters it trains and those it leaves alone, its loss, its judge.
+
+    Where it trains several ``networks``, ``trainable`` holds them by these names.
+    """
 
     trainable: Any
     frozen: Any
     loss: LossFunction
     validate: Validation
+    networks: tuple[str, ...] = ()
 
 
 def make_task(settings: Settings, stage: str, run_dir: str | Path) -> Task:
     """The task of a stage, from fresh parameters.
 
     Raises:
-        CheckpointError: "registration" without a trained overlap network in ``run_dir``.
+        CheckpointError: "registration" without a trained overlap network in ``run_dir``; "joint"
+            without both networks there or in ``config.train.start``.
     """
     model = settings.model
+    if stage == JOINT:
+        loss, validate = _joint_functions(settings)
+        return Task(_both_trained(settings, run_dir), None, loss, validate, STAGES)
     fresh = _first_params(settings)
     if stage == "overlap":
         loss, validate = _overlap_functions(settings)
@@ -92,6 +102,23 @@ def _first_params(settings: Settings) -> Params:
     return merged
 
 
+def _both_trained(settings: Settings, run_dir: str | Path) -> dict[str, Any]:
+    """Both networks of the run, or those of ``config.train.start`` where the run has none."""
+    trained = any((Path(run_dir) / stage).is_dir() for stage in STAGES)
+    params = load_best(run_dir, joint=False) if trained else _first_params(settings)
+    if (
+        params.overlap is None
+        or params.registration is None
+        or not (trained or settings.train.start)
+    ):
+        raise CheckpointError(
+            f"the joint stage goes on from two trained networks; {run_dir} does not hold both. "
+            "Train it with --stage=both first, or give weights with --config.train.start=FILE."
+        )
+    _require_model(params, settings.model, run_dir)
+    return {"overlap": params.overlap, "registration": params.registration}
+
+
 def _trained_overlap(model: ModelConfig, run_dir: str | Path) -> Any:
     params = load_best(run_dir) if (Path(run_dir) / "overlap").is_dir() else None
     if params is None or params.overlap is None:
@@ -99,12 +126,16 @@ def _trained_overlap(model: ModelConfig, run_dir: str | Path) -> Any:
             f"the registration stage needs a trained overlap network; {run_dir} has none. Train "
             "it first (--stage=overlap or both), or set config.registration.masks='truth'."
         )
+    _require_model(params, model, run_dir)
+    return params.overlap
+
+
+def _require_model(params: Params, model: ModelConfig, run_dir: str | Path) -> None:
     if params.config != model:
         raise CheckpointError(
             f"both networks of a run must be of one configuration; the overlap network in "
             f"{run_dir} is {params.config}, config.model is {model}. Give another --run_dir."
         )
-    return params.overlap
 
 
 def _overlap_functions(settings: Settings) -> tuple[LossFunction, Validation]:
@@ -178,6 +209,57 @@ def _registration_functions(settings: Settings) -> tuple[LossFunction, Validatio
             "error": errors.rotation_deg,
             "translation_error": errors.translation,
             "loss": registration_loss(found, pair, stage.weights)[0],
+        }
+
+    return loss, validate
+
+
+def _joint_functions(settings: Settings) -> tuple[LossFunction, Validation]:
+    model, gamma, weights = settings.model, settings.overlap.gamma, settings.registration.weights
+    in_turns = model.overlap_passes > 1
+    one = dataclasses.replace(model, iterations=1) if in_turns else model
+
+    def turn(networks, pair, start, dropout_key=None):
+        """One look, and the registration of what it found: from the start, if there is one."""
+        params = Params(networks["overlap"], networks["registration"], one)
+        *overlap, matched = predict_overlap_and_matches(
+            params, pair.source, pair.target, dropout_key, start
+        )
+        moved = pair if start is None else moved_pair(pair, start)
+        found = register_given_overlap(params, moved.source, moved.target, *overlap, dropout_key)
+        return overlap, matched, found, moved
+
+    def own_start(networks, pair, start):
+        found: Registration = turn(networks, pair, start)[2]
+        return rigid.compose(Rigid(found.rotation, found.translation), start)
+
+    def loss(trainable, frozen, pair, key):
+        start_key, choice_key, dropout_key = jax.random.split(key, 3)
+        start = None
+        if in_turns:
+            # Half of the pairs go on from where a turn of the networks themselves brings them.
+            start = jax.lax.cond(
+                jax.random.uniform(choice_key) < 0.5,
+                lambda motion: own_start(jax.lax.stop_gradient(trainable), pair, motion),
+                lambda motion: motion,
+                starting_motion(start_key, pair),
+            )
+        dropout_key = dropout_key if model.dropout else None
+        overlap, matched, found, moved = turn(trainable, pair, start, dropout_key)
+        first, overlap_terms = overlap_loss(*overlap, pair, gamma, matched)
+        second, registration_terms = registration_loss(found, moved, weights)
+        return first + second, JointTerms(*overlap_terms, *registration_terms)
+
+    def validate(trainable, frozen, pair):
+        params = Params(trainable["overlap"], trainable["registration"], model)
+        found = register_clouds(params, pair.source, pair.target)
+        errors = registration_errors(found, pair)
+        counts = pair_confusion(found.src_overlap, found.tgt_overlap, pair)
+        wrong = counts.false_positive + counts.false_negative
+        return {
+            "error": errors.rotation_deg,
+            "translation_error": errors.translation,
+            "overlap_error": wrong / (wrong + counts.true_positive + counts.true_negative),
         }
 
     return loss, validate

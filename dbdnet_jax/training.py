@@ -1,8 +1,9 @@
-"""Two-stage training: a pure step, and the loop that keeps its results.
+"""Training in stages: a pure step, and the loop that keeps its results.
 
 Stage "overlap" trains the overlap network, stage "registration" the registration network behind
-it, frozen and deterministic. Everything random comes from ``fold_in(key, step)``: a run that was
-killed and started again ends with the same parameters, bit for bit on a CPU.
+it, frozen and deterministic; stage "joint" may train both further. Everything random comes from
+``fold_in(key, step)``: a run that was killed and started again ends with the same parameters, bit
+for bit on a CPU.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from dbdnet_jax.checkpoint import Checkpoints, write_stage
+from dbdnet_jax.optimizer import make_optimizer, make_schedule
 from dbdnet_jax.parallel import mean_over_pairs, on_all_devices
 from dbdnet_jax.runlog import RunLog
 from dbdnet_jax.settings import Settings, TrainSettings, stage_record
@@ -50,23 +52,6 @@ class StepMetrics(NamedTuple):
     terms: Any
     gradient_norm: Float[Array, ""]
     finite: Bool[Array, ""]
-
-
-def make_schedule(peak: float, steps: int, warmup_steps: int) -> optax.Schedule:
-    """Linear warm-up to ``peak``, then a cosine that ends at 0 after ``steps``."""
-    warmup_steps = min(warmup_steps, steps - 1)
-    if warmup_steps < 1:
-        return optax.cosine_decay_schedule(peak, max(steps, 1))
-    first = peak / (warmup_steps + 1)  # not 0: the first step counts too
-    return optax.warmup_cosine_decay_schedule(first, peak, warmup_steps, steps)
-
-
-def make_optimizer(
-    schedule: optax.Schedule, *, weight_decay: float, clip_norm: float = 0.0
-) -> optax.GradientTransformation:
-    """AdamW (decay on every parameter, as the released code); ``clip_norm`` 0: no clipping."""
-    adamw = optax.adamw(schedule, weight_decay=weight_decay)
-    return optax.chain(optax.clip_by_global_norm(clip_norm), adamw) if clip_norm else adamw
 
 
 def init_state(
@@ -159,7 +144,12 @@ def run_task(
     epoch_steps = max(1, source.epoch_pairs // batch_size)
     total = max(1, round(epochs * epoch_steps))
     schedule = make_schedule(learning_rate, total, round(train.warmup_epochs * epoch_steps))
-    optimizer = make_optimizer(schedule, weight_decay=train.weight_decay, clip_norm=train.clip_norm)
+    optimizer = make_optimizer(
+        schedule,
+        weight_decay=train.weight_decay,
+        clip_norm=train.clip_norm,
+        networks=task.networks,
+    )
     with Checkpoints(folder) as checkpoints:
         state = init_state(task.trainable, optimizer, ema_decay=train.ema_decay)
         start = checkpoints.latest_step() or 0

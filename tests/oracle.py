@@ -94,6 +94,12 @@ def half_space_crop(points, direction, size):
     return np.array(sorted(sorted(range(len(points)), key=lambda i: -along[i])[:size]))
 
 
+def ball_crop(points, centre, size):
+    """Rows of the ``size`` points nearest to ``centre``, ascending."""
+    away = [sum((x - c) ** 2 for x, c in zip(point, centre, strict=True)) for point in points]
+    return np.array(sorted(sorted(range(len(points)), key=lambda i: away[i])[:size]))
+
+
 def knn(query, points, k, count):
     """The k nearest of the first ``count`` points, nearest first, padded with the nearest."""
     rows = []

@@ -110,6 +110,7 @@ def test_a_stage_may_resume_only_with_what_decides_its_outcome():
     base, other = (read_settings(with_change(registration__epochs=e)) for e in (1.0, 2.0))
     assert stage_record(base, "overlap") == stage_record(other, "overlap")
     assert stage_record(base, "registration") != stage_record(other, "registration")
+    assert stage_record(base, "joint") != stage_record(other, "joint")  # its loss is of both
     more_devices = read_settings(with_change(registration__epochs=1.0, train__devices=3))
     assert stage_record(base, "registration") == stage_record(more_devices, "registration")
 
@@ -124,6 +125,9 @@ def test_a_stage_may_resume_only_with_what_decides_its_outcome():
         ({"train__log_every": 30}, r"validate_every must be a multiple of .*log_every = 30"),
         ({"train__validation_pairs": 0}, r"validation_pairs must be at least 1; got 0"),
         ({"overlap__epochs": 0.0}, r"config\.overlap must have epochs > 0"),
+        ({"joint__batch_size": 0}, r"config\.joint must have .*; got epochs=20.0, batch_size=0"),
+        ({"data__varied": 1.5}, r"config\.data\.varied must be in \[0, 1\].*; got 1\.5 for 'cad'"),
+        ({"data__varied": 0.5, "data__name": "threedmatch"}, r"0 for 'threedmatch'.*got 0\.5"),
         ({"model__overlap_channels": 6}, r"multiple of 4"),
     ],
 )

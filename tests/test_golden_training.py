@@ -11,11 +11,12 @@ import pytest
 
 from configs import modelnet
 from dbdnet_jax.model.params import Params
+from dbdnet_jax.optimizer import make_optimizer
 from dbdnet_jax.parallel import on_all_devices
 from dbdnet_jax.released import to_released
 from dbdnet_jax.settings import read_settings
 from dbdnet_jax.stages import make_task
-from dbdnet_jax.training import init_state, make_optimizer, train_step
+from dbdnet_jax.training import init_state, train_step
 from tests.conftest import assert_close
 from tests.golden import (
     GRADIENT_NORM,

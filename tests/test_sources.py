@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from configs import threedmatch
 from dbdnet_jax.data.cad import cad_split
@@ -45,6 +46,22 @@ def test_procedural_shapes_are_trained_on_beside_the_others():
     more, _ = load_training_shapes(DataSettings("cad", "", "seen", procedural=3))
     assert len(more) == len(train) + 3 and set(more.libraries[-3:]) == {"procedural"}
     np.testing.assert_array_equal(more.points[: len(train)], train.points)
+
+
+def test_a_share_of_the_pairs_is_drawn_more_widely():
+    shapes = stand_in.shapes(count=2, points=64)
+    clean = dataclasses.replace(stand_in.PROTOCOL, noise_sigma=0.0)
+    key, points = jax.random.key(0), jnp.asarray(shapes.points)
+
+    def radii(varied):
+        pairs = shape_source(shapes, shapes, clean, seed=0, validation_pairs=1, varied=varied)
+        draw = jax.jit(lambda n: pairs.draw(jax.random.fold_in(key, n), n, points).target.points)
+        on_shape = cKDTree(points.reshape(-1, 3)).query
+        return np.array([on_shape(draw(jnp.asarray(n)))[0].max() for n in range(60)])
+
+    assert radii(0.0).max() < 1e-5
+    assert 0.15 < (radii(0.3) > 1e-3).mean() < 0.45  # another scale: no longer on the shape
+    assert (radii(1.0) > 1e-3).mean() > 0.9
 
 
 def test_every_twentieth_modelnet_shape_is_held_out(tmp_path):

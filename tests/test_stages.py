@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from configs import cad
-from dbdnet_jax.checkpoint import Checkpoints, load_best
+from dbdnet_jax.checkpoint import Checkpoints, load_best, write_stage
+from dbdnet_jax.losses import JointTerms
 from dbdnet_jax.safe_pickle import CheckpointError
-from dbdnet_jax.settings import Settings, read_settings
+from dbdnet_jax.settings import Settings, read_settings, stage_record
 from dbdnet_jax.sources import Source, shape_source
+from dbdnet_jax.stages import make_task
 from dbdnet_jax.training import fit
 from dbdnet_jax.weights import save_params
 from tests import stand_in
@@ -39,7 +41,7 @@ def settings() -> Settings:
     config.train.checkpoint_every = 2
     config.train.validate_every = 6
     config.train.validation_pairs = 2
-    config.overlap.epochs = config.registration.epochs = 3.0
+    config.overlap.epochs = config.registration.epochs = config.joint.epochs = 3.0
     config.registration.masks = "predicted"
     return read_settings(config)
 
@@ -146,6 +148,49 @@ def test_a_shape_with_nan_stops_the_overlap_stage(tmp_path):
         fit(
             SETTINGS, "overlap", tmp_path, pairs._replace(arrays=lambda _: itertools.repeat(points))
         )
+
+
+def test_the_joint_stage_trains_both_networks_further(run_dir, tmp_path):
+    weights = tmp_path / "weights.npz"
+    save_params(weights, load_best(run_dir))
+    settings = dataclasses.replace(
+        SETTINGS,
+        model=dataclasses.replace(SETTINGS.model, overlap_passes=2),
+        train=dataclasses.replace(SETTINGS.train, start=str(weights), clip_norm=1.0),
+    )
+    fit(settings, "joint", tmp_path / "run", source())
+    start, found = load_best(run_dir), load_best(tmp_path / "run")
+    for before, after in ((start.overlap, found.overlap), (start.registration, found.registration)):
+        moved = jax.tree.leaves(jax.tree.map(lambda a, b: bool((a != b).any()), before, after))
+        assert np.mean(moved) > 0.9
+    with (tmp_path / "run" / "joint" / "train.csv").open() as file:
+        for row in csv.DictReader(file):
+            terms = [float(value) for name, value in row.items() if name in JointTerms._fields]
+            assert len(terms) == 7 and float(row["loss"]) == pytest.approx(sum(terms), rel=1e-4)
+
+
+def test_the_joint_stage_goes_on_from_the_run_and_then_is_what_the_run_holds(run_dir, tmp_path):
+    for stage in ("overlap", "registration"):
+        (tmp_path / stage).symlink_to(run_dir / stage)
+    task = make_task(SETTINGS, "joint", tmp_path)
+    trained = load_best(run_dir)
+    further = jax.tree.map(lambda leaf: leaf + 1, task.trainable)
+    with Checkpoints(tmp_path / "joint") as checkpoints:
+        checkpoints.save(6, {"params": further}, error=1.0)
+    write_stage(tmp_path / "joint", stage_record(SETTINGS, "joint"))
+    again, held = make_task(SETTINGS, "joint", tmp_path), load_best(tmp_path)
+    for name in ("overlap", "registration"):
+        for found in (task.trainable[name], again.trainable[name]):
+            jax.tree.map(lambda a, b: assert_close(a, b, EXACT), found, getattr(trained, name))
+        jax.tree.map(lambda a, b: assert_close(a, b, EXACT), getattr(held, name), further[name])
+
+
+def test_the_joint_stage_needs_both_networks(run_dir, tmp_path):
+    with pytest.raises(CheckpointError, match="two trained networks; .*--stage=both first"):
+        fit(SETTINGS, "joint", tmp_path, source())
+    (tmp_path / "overlap").symlink_to(run_dir / "overlap")
+    with pytest.raises(CheckpointError, match="two trained networks; .*config.train.start=FILE"):
+        fit(SETTINGS, "joint", tmp_path, source())
 
 
 def test_registration_needs_the_overlap_network(tmp_path):

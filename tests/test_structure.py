@@ -19,10 +19,11 @@ model.config model.blocks model.edgeconv model.encoder model.matching model.para
 model.registration model.stack model.look model.dbdnet
 losses metrics recall
 data.shapes data.surface data.solids data.household data.furniture data.parts data.procedural
-data.overlap data.symmetry data.pairs data.cad data.modelnet40 data.threedmatch data.frozen
+data.overlap data.symmetry data.pairs data.varied
+data.cad data.modelnet40 data.threedmatch data.frozen
 released weights checkpoint
 baselines.classical
-programs settings sources pair_sets parallel runlog stages training
+programs settings sources pair_sets parallel runlog optimizer stages training
 polish evaluation report sweep
 alignment.reading alignment.thinning alignment.judging alignment.search alignment.scene
 alignment.success alignment.verdict alignment.pose_graph

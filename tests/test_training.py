@@ -14,9 +14,10 @@ import optax
 import pytest
 
 from dbdnet_jax.checkpoint import Checkpoints
+from dbdnet_jax.optimizer import make_optimizer, make_schedule
 from dbdnet_jax.parallel import mean_over_pairs, on_all_devices
 from dbdnet_jax.runlog import RunLog
-from dbdnet_jax.training import init_state, make_optimizer, make_schedule, train_step
+from dbdnet_jax.training import init_state, train_step
 from tests import stand_in
 from tests.conftest import EXACT, FLOAT32, assert_close, assert_finite
 
@@ -255,6 +256,19 @@ def test_clipping_bounds_the_norm_of_the_gradient():
         _, state = optimizer.update(gradient, optimizer.init(params), params)
         moment = optax.tree_utils.tree_get(state, "mu")["x"]
         assert_close(jnp.linalg.norm(moment), mu, FLOAT32)
+
+
+def test_each_network_is_clipped_by_its_own_norm():
+    names = ("a", "b")
+    params = {name: {"x": jnp.zeros(2)} for name in names}
+    gradient = {"a": {"x": jnp.asarray([30.0, 40.0])}, "b": {"x": jnp.asarray([0.3, 0.4])}}
+    optimizer = make_optimizer(
+        optax.constant_schedule(1e-3), weight_decay=0.0, clip_norm=1.0, networks=names
+    )
+    _, state = optimizer.update(gradient, optimizer.init(params), params)
+    moments = optax.tree_utils.tree_get(state, "mu")
+    assert_close(jnp.linalg.norm(moments["a"]["x"]), 0.1, FLOAT32)  # a tenth of the limit
+    assert_close(jnp.linalg.norm(moments["b"]["x"]), 0.05, FLOAT32)  # a tenth of its own
 
 
 def test_the_log_drops_what_is_done_again_and_torn_rows(tmp_path):

@@ -75,13 +75,34 @@ def random_direction(key: PRNGKeyArray) -> Float[Array, "3"]:
 
 
 def half_space_crop(
-    points: Float[Array, "n 3"], direction: Float[Array, "3"], size: int
+    points: Float[Array, "n 3"],
+    direction: Float[Array, "3"],
+    size: int,
+    count: Float[Array, ""] | Int[Array, ""] | None = None,
 ) -> Int[Array, " size"]:
     """Indices of the ``size`` points farthest along ``direction``, in their given order.
 
     That is a cut by a plane normal to ``direction``, placed so that exactly ``size`` points
-    remain (RPM-Net, Yew & Lee 2020).
+    remain (RPM-Net, Yew & Lee 2020). Of the first ``count`` points, which must be as many; of all,
+    if None.
     """
-    along = jnp.sum(points * direction[None, :], axis=-1)
-    _, rows = jax.lax.top_k(along, size)
-    return jnp.sort(rows)
+    return _largest(jnp.sum(points * direction[None, :], axis=-1), size, count)
+
+
+def ball_crop(
+    points: Float[Array, "n 3"],
+    centre: Float[Array, "3"],
+    size: int,
+    count: Float[Array, ""] | Int[Array, ""] | None = None,
+) -> Int[Array, " size"]:
+    """Indices of the ``size`` points nearest to ``centre`` (PRNet, Wang & Solomon 2019).
+
+    Otherwise as `half_space_crop`.
+    """
+    return _largest(-jnp.sum((points - centre[None, :]) ** 2, axis=-1), size, count)
+
+
+def _largest(score, size, count):
+    if count is not None:
+        score = jnp.where(jnp.arange(score.shape[0]) < count, score, -jnp.inf)
+    return jnp.sort(jax.lax.top_k(score, size)[1])

@@ -141,6 +141,16 @@ def test_a_crop_keeps_exactly_so_many_points_on_one_side_of_a_plane(size, precis
     assert along[rows].min() > along[dropped].max(initial=-np.inf)
 
 
+@pytest.mark.parametrize("crop", ["half_space_crop", "ball_crop"])
+def test_a_crop_chooses_among_the_first_points_only(crop):
+    points, where = random_cloud(8, 50), np.array([0.48, -0.6, 0.64])
+    cut = jax.jit(getattr(sampling, crop), static_argnums=2)
+    for count in (20, 33, 50):
+        expected = getattr(oracle, crop)(points[:count], where, 20)
+        assert_same_rows(cut(points, where, 20, jnp.asarray(count)), expected)
+    assert_same_rows(cut(points, where, 20), expected)
+
+
 def test_a_crop_of_equal_points_still_has_its_size():
     rows = half_space_crop(np.zeros((20, 3)), np.array([0.0, 0.0, 1.0]), 14).tolist()
     assert len(rows) == len(set(rows)) == 14

@@ -1,0 +1,65 @@
+"""Pairs drawn more widely than a protocol says, to train networks that will meet such pairs."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from dbdnet_jax.data.pairs import Protocol, Recipe, assemble
+from dbdnet_jax.ops import rigid
+from dbdnet_jax.ops.sampling import ball_crop, half_space_crop, random_direction
+from dbdnet_jax.types import Pair
+
+LEAST_KEPT = 0.5
+MOST_NOISE = 3.0  # times the protocol's
+CLEAN = 0.25  # of the pairs
+LARGEST_SCALE = 1.2  # and its inverse the smallest
+
+
+def make_varied_pair(
+    key: PRNGKeyArray, points: Float[Array, "s 3"], normals: Float[Array, "s 3"], protocol: Protocol
+) -> Pair:
+    """One pair of a shape, as large as the protocol's clouds, everything else drawn more widely.
+
+    The part that a crop leaves is 0.5 to 1 (the denser the shape was sampled, the smaller the
+    part); the crop is by a plane or takes what is nearest to a point on the unit sphere (PRNet,
+    Wang & Solomon 2019); the noise is none or up to three times the protocol's; half of the pairs
+    are disjoint; shapes are larger and smaller by up to a fifth. Motions are the protocol's.
+
+    Raises:
+        ValueError: two clouds of the protocol's size are more than the shape has.
+    """
+    total = points.shape[0]
+    if 2 * protocol.size > total:
+        raise ValueError(
+            f"varied pairs of {protocol.size} points need shapes of at least {2 * protocol.size}; "
+            f"got {total}. Lower protocol.points, or set config.data.varied=0."
+        )
+    rows_key, crop_key, motion_key, noise_key, choice_key = jax.random.split(key, 5)
+    chance = jax.random.uniform(choice_key, (4,))
+    points = points * LARGEST_SCALE ** (2 * chance[0] - 1)
+
+    disjoint = chance[1] < 0.5
+    order, other = (jax.random.permutation(k, total) for k in jax.random.split(rows_key))
+    orders = order, jnp.where(disjoint, order[::-1], other)
+    kept = LEAST_KEPT + (1 - LEAST_KEPT) * chance[2]
+    drawn = jnp.minimum(protocol.size / kept, jnp.where(disjoint, total // 2, total))
+
+    def crop(key, rows):
+        side_key, style_key = jax.random.split(key)
+        args = points[rows], random_direction(side_key), protocol.size, drawn
+        by_plane = jax.random.uniform(style_key) < 0.5
+        return rows[jnp.where(by_plane, half_space_crop(*args), ball_crop(*args))]
+
+    source, target = (
+        crop(k, rows) for k, rows in zip(jax.random.split(crop_key), orders, strict=True)
+    )
+    motion = rigid.random_rigid(
+        motion_key, math.radians(protocol.max_angle_deg), protocol.max_translation
+    )
+    amount = jnp.maximum(chance[3] - CLEAN, 0) / (1 - CLEAN) * MOST_NOISE
+    noise = protocol.noise_sigma * amount * jax.random.normal(noise_key, (2, protocol.size, 3))
+    noise = jnp.clip(noise, -protocol.noise_clip, protocol.noise_clip)
+    recipe = Recipe(source, target, motion, noise[0], noise[1])
+    return assemble(recipe, points, normals, protocol.overlap_radius)
