@@ -1,7 +1,8 @@
-"""Train DBDNet: the overlap network, then the registration network behind it.
+"""Train DBDNet: the overlap network, then the registration network behind it; then perhaps both.
 
     python train.py --config=configs/cad_short.py
     python train.py --config=configs/cad.py --config.train.batch_size=4 --run_dir=runs/mine
+    python train.py --config=configs/cad.py --stage=joint  # goes on from runs/cad
 
 A run that was stopped goes on when the same command is given again. The best weights end up in
 RUN_DIR/params.npz, the curves in RUN_DIR/STAGE/*.csv and, for TensorBoard, beside them.
@@ -45,7 +46,7 @@ def main(argv: list[str]) -> None:
         settings = read_settings(CONFIG.value)
         # Before anything asks JAX for a device: the number is fixed from then on. More devices
         # than pairs in a step would have nothing to do.
-        pairs = max(getattr(settings, stage).batch_size for stage in stages)
+        pairs = max(getattr(settings, stage).batch_size for stage in (*STAGES, JOINT))
         devices = settings.train.devices or min(os.cpu_count() or 1, pairs)
         jax.config.update("jax_num_cpu_devices", devices)
         keep_compiled_programs()

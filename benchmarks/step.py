@@ -1,4 +1,4 @@
-"""Time and memory of one answer, and of one training step of each stage, for a configuration.
+"""Time and memory of one answer, and of one training step of either network, for a configuration.
 
     python -m benchmarks.step --config=configs/modelnet.py
     python -m benchmarks.step --config=configs/cad.py

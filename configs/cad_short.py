@@ -23,4 +23,5 @@ def get_config() -> ConfigDict:
     config.train.checkpoint_every = 500
     config.overlap.epochs = 2.0
     config.registration.epochs = 4.0
+    config.joint.epochs = 1.0
     return config

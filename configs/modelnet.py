@@ -7,7 +7,8 @@ mean rotation error of 4.612 degrees and a mean translation error of 0.085. For 
 categories add --config.data.categories=seen; without noise, --config.protocol.noise_sigma=0.0.
 
 Departs from the paper in one thing: every 20th training shape is held out to choose the best
-checkpoint, because nothing here is chosen on test shapes.
+checkpoint, because nothing here is chosen on test shapes. `config.joint` is for --stage=joint,
+which the paper does not have, and nothing else reads it.
 """
 
 from ml_collections import ConfigDict
@@ -95,7 +96,7 @@ def _model() -> ConfigDict:
 
 
 def _train() -> ConfigDict:
-    """What both stages share."""
+    """What all stages share."""
     return ConfigDict(
         {
             "seed": 0,

@@ -22,4 +22,6 @@ def get_config() -> ConfigDict:
     config.registration.epochs = 50.0
     config.registration.batch_size = 1
     config.registration.weights.rotation = 5.0
+    config.joint.epochs = 10.0  # not of the paper
+    config.joint.batch_size = 1
     return config

@@ -9,9 +9,16 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dbdnet_jax.alignment import search
-from dbdnet_jax.alignment.judging import inlier_distance, judge
+from dbdnet_jax.alignment.judging import coincidence, inlier_distance, judge
 from dbdnet_jax.alignment.reading import read_points
-from dbdnet_jax.alignment.scene import Scene, Side, as_given, build_scene, guess_in_scene
+from dbdnet_jax.alignment.scene import (
+    Scene,
+    Side,
+    as_given,
+    build_scene,
+    guess_in_scene,
+    is_whole,
+)
 from dbdnet_jax.alignment.search import Proposal, Transform
 from dbdnet_jax.alignment.success import Evidence, gather, load_coefficients, success_probability
 from dbdnet_jax.alignment.verdict import doubt, warnings
@@ -147,9 +154,11 @@ def _report(
 ) -> Alignment:
     """Everything that is known of a pose, in the units and rows of the clouds as given."""
     clouds = scene.source.sparse, scene.target.sparse
-    judgement = judge(search.move(pose, scene.source.dense), scene.target.dense, distance)
+    dense = search.move(pose, scene.source.dense), scene.target.dense
+    judgement = judge(*dense, distance)
     rival = search.best_rival(pose, *clouds)
-    evidence = gather(proposal, pose, judgement, rival)
+    shared = coincidence(*dense, distance) if is_whole(scene) else 0.0
+    evidence = gather(proposal, pose, judgement, rival, shared)
     probability = success_probability(evidence, load_coefficients())
     reason = doubt(scene, proposal, judgement, probability)
     laps["judge"] = time.perf_counter()

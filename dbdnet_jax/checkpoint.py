@@ -18,10 +18,10 @@ import numpy as np
 
 from dbdnet_jax.files import write_whole
 from dbdnet_jax.model.config import ModelConfig
-from dbdnet_jax.model.params import Params
+from dbdnet_jax.model.params import NETWORKS, Params
 from dbdnet_jax.safe_pickle import CheckpointError
 
-STAGES = ("overlap", "registration")  # named as the networks they train
+STAGES = NETWORKS  # each is named as the network it trains
 JOINT = "joint"  # both networks, further
 KEPT = 2  # newest checkpoints; the second survives when the first is damaged
 

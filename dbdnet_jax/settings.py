@@ -51,7 +51,7 @@ class DataSettings:
 
 @dataclasses.dataclass(frozen=True)
 class TrainSettings:
-    """What both stages share; cadences are in steps, 0 switches clipping and the average off.
+    """What all stages share; cadences are in steps, 0 switches clipping and the average off.
 
     ``start`` is a file of weights that the networks in it start from ("": fresh ones).
     ``batch_size`` and ``learning_rate`` are what the stages' own fields follow until set.
@@ -63,7 +63,7 @@ class TrainSettings:
     learning_rate: float
     weight_decay: float
     warmup_epochs: float
-    clip_norm: float  # global norm of the gradient
+    clip_norm: float  # global norm of a network's gradient
     ema_decay: float  # of the moving average of the weights, which then is what is kept
     log_every: int
     validate_every: int

@@ -20,7 +20,7 @@ from dbdnet_jax.data.modelnet40 import load_modelnet40
 from dbdnet_jax.data.pairs import Protocol, make_pair
 from dbdnet_jax.data.procedural import procedural_shapes
 from dbdnet_jax.data.shapes import Shapes, joined, select
-from dbdnet_jax.data.varied import make_varied_pair
+from dbdnet_jax.data.varied import make_varied_pair, require_enough_points
 from dbdnet_jax.files import cache_folder
 from dbdnet_jax.settings import DataSettings, Settings
 from dbdnet_jax.types import Pair
@@ -97,13 +97,15 @@ def shape_source(
     Of the training pairs a share of ``varied`` is drawn by `make_varied_pair`.
 
     Raises:
-        ValueError: no shape to train or to validate on.
+        ValueError: no shape to train or to validate on, or shapes of too few points.
     """
     if not len(train) or not len(validation):
         raise ValueError(
             "training and validation need at least one shape each; got "
             f"{len(train)} and {len(validation)}. Choose other config.data.categories."
         )
+    if varied:
+        require_enough_points(train.points.shape[1], protocol)
     count = len(train)
     order_key = jax.random.key(seed)
 

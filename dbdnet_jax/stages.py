@@ -84,43 +84,50 @@ def _first_params(settings: Settings) -> Params:
     fresh = init_params(jax.random.key(settings.train.seed), settings.model)
     if not settings.train.start:
         return fresh
+    start = _start_params(settings)
+    return Params(
+        start.overlap or fresh.overlap, start.registration or fresh.registration, settings.model
+    )
+
+
+def _start_params(settings: Settings) -> Params:
+    """The networks in ``config.train.start``: one or both, of the configuration's widths."""
     if not Path(settings.train.start).is_file():
         raise FileNotFoundError(
             "config.train.start must be a file of weights; there is none at "
             f"{settings.train.start}. Give its path, or '' to start from fresh weights."
         )
     start = load_params(settings.train.start)
-    merged = Params(
-        start.overlap or fresh.overlap, start.registration or fresh.registration, settings.model
-    )
+    held = [name for name in STAGES if getattr(start, name) is not None]
     require_shapes(
-        {name: array.shape for name, array in flatten(merged).items()},
-        parameter_shapes(settings.model),
+        {name: array.shape for name, array in flatten(start).items()},
+        parameter_shapes(settings.model, held),
         f"config.train.start={settings.train.start}",
         "Give weights of the same widths as config.model, or set config.train.start=''.",
     )
-    return merged
+    return dataclasses.replace(start, config=settings.model)
 
 
 def _both_trained(settings: Settings, run_dir: str | Path) -> dict[str, Any]:
-    """Both networks of the run, or those of ``config.train.start`` where the run has none."""
-    trained = any((Path(run_dir) / stage).is_dir() for stage in STAGES)
-    params = load_best(run_dir, joint=False) if trained else _first_params(settings)
-    if (
-        params.overlap is None
-        or params.registration is None
-        or not (trained or settings.train.start)
-    ):
+    """Both networks of the run or, where it has none, of ``config.train.start``."""
+    params, where = None, str(run_dir)
+    if any((Path(run_dir) / stage).is_dir() for stage in STAGES):
+        params = load_best(run_dir, joint=False)
+        _require_model(params, settings.model, run_dir)
+    elif settings.train.start:
+        params, where = _start_params(settings), settings.train.start
+    if params is None or params.overlap is None or params.registration is None:
         raise CheckpointError(
-            f"the joint stage goes on from two trained networks; {run_dir} does not hold both. "
-            "Train it with --stage=both first, or give weights with --config.train.start=FILE."
+            f"the joint stage goes on from two trained networks; {where} does not hold both. Train "
+            "them in that folder first (--stage=both), or give a new --run_dir and "
+            "--config.train.start=FILE with both."
         )
-    _require_model(params, settings.model, run_dir)
     return {"overlap": params.overlap, "registration": params.registration}
 
 
 def _trained_overlap(model: ModelConfig, run_dir: str | Path) -> Any:
-    params = load_best(run_dir) if (Path(run_dir) / "overlap").is_dir() else None
+    has_one = (Path(run_dir) / "overlap").is_dir()
+    params = load_best(run_dir, joint=False) if has_one else None
     if params is None or params.overlap is None:
         raise CheckpointError(
             f"the registration stage needs a trained overlap network; {run_dir} has none. Train "
@@ -133,8 +140,8 @@ def _trained_overlap(model: ModelConfig, run_dir: str | Path) -> Any:
 def _require_model(params: Params, model: ModelConfig, run_dir: str | Path) -> None:
     if params.config != model:
         raise CheckpointError(
-            f"both networks of a run must be of one configuration; the overlap network in "
-            f"{run_dir} is {params.config}, config.model is {model}. Give another --run_dir."
+            f"both networks of a run must be of one configuration; {run_dir} holds one of "
+            f"{params.config}, config.model is {model}. Give another --run_dir."
         )
 
 
@@ -166,11 +173,13 @@ def _overlap_functions(settings: Settings) -> tuple[LossFunction, Validation]:
     return loss, validate
 
 
+def _from_anywhere(model: ModelConfig) -> bool:
+    """Whether each turn is trained for itself, from starts such as those before it may leave."""
+    return (model.overlap_passes > 1 or model.iterations > 1) and not model.released
+
+
 def _registration_functions(settings: Settings) -> tuple[LossFunction, Validation]:
     model, stage = settings.model, settings.registration
-
-    # Each pass and each iteration is trained for itself, from starts as those before it may leave.
-    from_anywhere = (model.overlap_passes > 1 or model.iterations > 1) and not model.released
 
     def given(key, frozen, pair, start):
         if stage.masks == "predicted":
@@ -187,7 +196,7 @@ def _registration_functions(settings: Settings) -> tuple[LossFunction, Validatio
 
     def loss(trainable, frozen, pair, key):
         mask_key, start_key, dropout_key = jax.random.split(key, 3)
-        start = starting_motion(start_key, pair) if from_anywhere else None
+        start = starting_motion(start_key, pair) if _from_anywhere(model) else None
         masks = given(mask_key, frozen, pair, start)
         one = model
         if start is not None:
@@ -216,8 +225,7 @@ def _registration_functions(settings: Settings) -> tuple[LossFunction, Validatio
 
 def _joint_functions(settings: Settings) -> tuple[LossFunction, Validation]:
     model, gamma, weights = settings.model, settings.overlap.gamma, settings.registration.weights
-    in_turns = model.overlap_passes > 1
-    one = dataclasses.replace(model, iterations=1) if in_turns else model
+    one = dataclasses.replace(model, iterations=1) if _from_anywhere(model) else model
 
     def turn(networks, pair, start, dropout_key=None):
         """One look, and the registration of what it found: from the start, if there is one."""
@@ -236,7 +244,7 @@ def _joint_functions(settings: Settings) -> tuple[LossFunction, Validation]:
     def loss(trainable, frozen, pair, key):
         start_key, choice_key, dropout_key = jax.random.split(key, 3)
         start = None
-        if in_turns:
+        if _from_anywhere(model):
             # Half of the pairs go on from where a turn of the networks themselves brings them.
             start = jax.lax.cond(
                 jax.random.uniform(choice_key) < 0.5,

@@ -193,6 +193,9 @@ class _Loop:
         validate = jax.jit(self._mean_validation)
         window: list[dict[str, float]] = []
         waiting: list[StepMetrics] = []
+        if self.task.networks and not start:
+            # They are trained already, and what follows may be worse.
+            self._validate_and_save(0, state, validate, frozen, pairs)
         with self._bar(start) as bar:
             for done in range(start + 1, self.total + 1):
                 state, metrics = step(state, frozen, key, next(arrays))
@@ -209,12 +212,7 @@ class _Loop:
                 bar.set_postfix(self._write_row(done, window))
                 window = []
                 if done % train.validate_every == 0 or done == self.total:
-                    weights = state.params if state.ema is None else state.ema
-                    means = validate(weights, frozen, pairs)
-                    row = {name: float(value) for name, value in means.items()}
-                    self._require_finite(row, state, "in the validation")
-                    self.log.write("validation", done, row)
-                    self.checkpoints.save(done, state, row["error"])
+                    self._validate_and_save(done, state, validate, frozen, pairs)
                 elif done % train.checkpoint_every == 0:
                     self.checkpoints.save(done, state)
 
@@ -236,6 +234,15 @@ class _Loop:
         row["learning_rate"] = float(self.schedule(done - 1))
         self.log.write("train", done, row)
         return {"loss": f"{row['loss']:.4f}"}
+
+    def _validate_and_save(
+        self, done: int, state: TrainState, validate: Callable[..., Any], frozen: Any, pairs: Pair
+    ) -> None:
+        means = validate(state.params if state.ema is None else state.ema, frozen, pairs)
+        row = {name: float(value) for name, value in means.items()}
+        self._require_finite(row, state, "in the validation")
+        self.log.write("validation", done, row)
+        self.checkpoints.save(done, state, row["error"])
 
     def _mean_validation(self, weights: Any, frozen: Any, pairs: Pair) -> dict[str, Array]:
         def one(i, weights, frozen, pairs):

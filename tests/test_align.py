@@ -8,10 +8,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 from dbdnet_jax.align import Alignment
-from dbdnet_jax.alignment.judging import Motion, in_words, inlier_distance, judge
-from dbdnet_jax.alignment.scene import build_scene
+from dbdnet_jax.alignment.judging import (
+    UNRELATED,
+    Motion,
+    coincidence,
+    in_words,
+    inlier_distance,
+    judge,
+)
+from dbdnet_jax.alignment.scene import build_scene, is_whole
 from dbdnet_jax.alignment.success import (
     Coefficients,
     Evidence,
@@ -222,6 +230,33 @@ def test_information_is_the_curvature_of_the_plane_residuals():
     # 2000 points that are off by plane_rmse fix a translation to about this, in each direction.
     sigma = np.sqrt(np.diag(np.linalg.inv(judgement.information))[3:])
     assert np.all(sigma < 10 * judgement.plane_rmse / np.sqrt(2000))
+
+
+@pytest.mark.parametrize("even", [False, True])
+def test_points_coincide_where_clouds_share_them_in_the_right_pose_only(even):
+    points, others = cylinder(2000, 1), cylinder(2000, 2)
+    if even:
+        points, others = (cloud[farthest_rows(cloud, 1200)] for cloud in (points, others))
+    turn = Rotation.from_rotvec([0, 0, 20], degrees=True).as_matrix()
+    spacing = np.median(cKDTree(points).query(points, k=2)[0][:, 1])
+    noisy = points + random_cloud(3, len(points)) * 0.2 * spacing
+
+    def between(source, target):
+        return coincidence(source, target, inlier_distance(source, target))
+
+    assert between(points, points) == UNRELATED
+    assert between(noisy, points) > 0.3
+    assert between(points @ turn.T, points) < 0.02 and between(others, points) < 0.02
+    assert between(points + 9.0, points) == 0.0
+
+
+def test_clouds_that_a_grid_has_thinned_are_not_asked_whether_points_coincide():
+    few, many = (
+        build_scene(c, c, "auto", 100, np.eye(4)) for c in (solid(500, 1), solid(11_000, 1))
+    )
+    assert is_whole(few) and not is_whole(many)
+    stray = np.vstack([solid(500, 1), [[50.0, 0, 0]]])
+    assert is_whole(build_scene(stray, stray, "auto", 100, np.eye(4)))
 
 
 def test_a_symmetric_shape_is_refused_and_its_motion_named():

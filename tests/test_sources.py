@@ -64,6 +64,12 @@ def test_a_share_of_the_pairs_is_drawn_more_widely():
     assert (radii(1.0) > 1e-3).mean() > 0.9
 
 
+def test_shapes_too_small_to_draw_widely_are_refused_before_anything_starts():
+    shapes = stand_in.shapes(count=2, points=20)
+    with pytest.raises(ValueError, match="points need shapes of at least 24; got 20"):
+        shape_source(shapes, shapes, stand_in.PROTOCOL, seed=0, validation_pairs=1, varied=0.1)
+
+
 def test_every_twentieth_modelnet_shape_is_held_out(tmp_path):
     for number, name in enumerate(FILES["train"]):
         write_file(tmp_path / name, range(9), number)

@@ -11,6 +11,7 @@ import pytest
 from configs import cad
 from dbdnet_jax.checkpoint import Checkpoints, load_best, write_stage
 from dbdnet_jax.losses import JointTerms
+from dbdnet_jax.model.params import Params
 from dbdnet_jax.safe_pickle import CheckpointError
 from dbdnet_jax.settings import Settings, read_settings, stage_record
 from dbdnet_jax.sources import Source, shape_source
@@ -156,17 +157,29 @@ def test_the_joint_stage_trains_both_networks_further(run_dir, tmp_path):
     settings = dataclasses.replace(
         SETTINGS,
         model=dataclasses.replace(SETTINGS.model, overlap_passes=2),
-        train=dataclasses.replace(SETTINGS.train, start=str(weights), clip_norm=1.0),
+        train=dataclasses.replace(
+            SETTINGS.train, start=str(weights), clip_norm=1.0, weight_decay=0.0
+        ),
     )
-    fit(settings, "joint", tmp_path / "run", source())
-    start, found = load_best(run_dir), load_best(tmp_path / "run")
+    pairs = source()
+    stopping = pairs._replace(arrays=lambda start: itertools.islice(pairs.arrays(start), 3))
+    with pytest.raises(StopIteration):
+        fit(settings, "joint", tmp_path / "run", stopping)
+    fit(settings, "joint", tmp_path / "run", pairs)
+    start = load_best(run_dir)
+    with Checkpoints(tmp_path / "run" / "joint") as checkpoints:
+        found = Params(**checkpoints.restore_weights(6), config=settings.model)
     for before, after in ((start.overlap, found.overlap), (start.registration, found.registration)):
         moved = jax.tree.leaves(jax.tree.map(lambda a, b: bool((a != b).any()), before, after))
         assert np.mean(moved) > 0.9
     with (tmp_path / "run" / "joint" / "train.csv").open() as file:
-        for row in csv.DictReader(file):
-            terms = [float(value) for name, value in row.items() if name in JointTerms._fields]
-            assert len(terms) == 7 and float(row["loss"]) == pytest.approx(sum(terms), rel=1e-4)
+        rows = list(csv.DictReader(file))
+    assert [row["step"] for row in rows] == ["2", "4", "6"]
+    for row in rows:
+        terms = [float(value) for name, value in row.items() if name in JointTerms._fields]
+        assert len(terms) == 7 and float(row["loss"]) == pytest.approx(sum(terms), rel=1e-4)
+    with (tmp_path / "run" / "joint" / "validation.csv").open() as file:
+        assert [row["step"] for row in csv.DictReader(file)] == ["0", "6"]
 
 
 def test_the_joint_stage_goes_on_from_the_run_and_then_is_what_the_run_holds(run_dir, tmp_path):
@@ -185,8 +198,37 @@ def test_the_joint_stage_goes_on_from_the_run_and_then_is_what_the_run_holds(run
         jax.tree.map(lambda a, b: assert_close(a, b, EXACT), getattr(held, name), further[name])
 
 
+def test_networks_that_do_not_take_turns_can_be_trained_jointly_too(run_dir):
+    task, key = make_task(SETTINGS, "joint", run_dir), jax.random.key(0)
+    pair = jax.tree.map(lambda leaf: leaf[0], source().validation)
+    shape = jax.eval_shape(
+        jax.grad(task.loss, has_aux=True), task.trainable, task.frozen, pair, key
+    )[0]
+    assert jax.tree.map(lambda leaf: leaf.shape, shape) == jax.tree.map(
+        lambda leaf: leaf.shape, task.trainable
+    )
+
+
+def test_the_frozen_network_of_registration_is_never_the_joint_one(run_dir, tmp_path):
+    (tmp_path / "overlap").symlink_to(run_dir / "overlap")
+    params = load_best(run_dir)
+    other = jax.tree.map(
+        lambda leaf: leaf + 1, {"overlap": params.overlap, "registration": params.registration}
+    )
+    with Checkpoints(tmp_path / "joint") as checkpoints:
+        checkpoints.save(6, {"params": other}, error=1.0)
+    write_stage(tmp_path / "joint", stage_record(SETTINGS, "joint"))
+    frozen = make_task(SETTINGS, "registration", tmp_path).frozen
+    jax.tree.map(lambda a, b: assert_close(a, b, EXACT), frozen, params.overlap)
+
+
 def test_the_joint_stage_needs_both_networks(run_dir, tmp_path):
-    with pytest.raises(CheckpointError, match="two trained networks; .*--stage=both first"):
+    weights = tmp_path / "weights.npz"
+    save_params(weights, dataclasses.replace(load_best(run_dir), registration=None))
+    train = dataclasses.replace(SETTINGS.train, start=str(weights))
+    with pytest.raises(CheckpointError, match=r"weights\.npz does not hold both. Train them in"):
+        fit(dataclasses.replace(SETTINGS, train=train), "joint", tmp_path, source())
+    with pytest.raises(CheckpointError, match="two trained networks; .*--stage=both"):
         fit(SETTINGS, "joint", tmp_path, source())
     (tmp_path / "overlap").symlink_to(run_dir / "overlap")
     with pytest.raises(CheckpointError, match="two trained networks; .*config.train.start=FILE"):

@@ -3,7 +3,8 @@
     python -m tools.ship_weights runs/cad --pairs 32100 32100
     python -m tools.ship_weights runs/overlap runs/registration --pairs 104576 39260
 
-Takes the overlap network of the first run and the registration network of the last, scores them on
+Takes the overlap network of the first run and the registration network of the last (those of the
+joint stage where it has run; its pairs count for both networks), scores them on
 the validation pairs and on the frozen test pairs of configs/cad.py, and writes
 dbdnet_jax/pretrained/NAME.npz. Fit the success probability anew afterwards:
 `python -m tools.fit_success`.

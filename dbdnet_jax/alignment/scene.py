@@ -78,6 +78,12 @@ def as_given(pose: Transform, scene: Scene) -> Transform:
     return transform
 
 
+def is_whole(scene: Scene) -> bool:
+    """Whether a pose is judged on all points of both clouds, but for strays."""
+    sides = scene.source, scene.target
+    return all(len(side.dense) + side.thinned.strays == len(side.points) for side in sides)
+
+
 def size_ratio(scene: Scene) -> float:
     """The larger cloud's size per the smaller one's."""
     sizes = scene.source.thinned.size, scene.target.thinned.size

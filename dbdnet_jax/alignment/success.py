@@ -23,6 +23,7 @@ class Evidence(NamedTuple):
     """What speaks for or against a pose; every entry free of units."""
 
     residual: float  # distance along the normals, root mean square, per inlier distance
+    coincidence: float  # of points that both clouds have in common, see `judging.coincidence`
     sureness: float  # mean distance of the overlap probabilities from one half
     stiffness: float  # logarithm of the least held motion's stiffness
     correction: float  # logarithm of 1 + degrees between the network's pose and the refined one
@@ -31,11 +32,14 @@ class Evidence(NamedTuple):
     crowd: float  # how many turns of the pose end in another one that fits about as well
 
 
-def gather(proposal: Proposal, pose: Transform, judgement: Judgement, rival: Rival) -> Evidence:
+def gather(
+    proposal: Proposal, pose: Transform, judgement: Judgement, rival: Rival, coincidence: float
+) -> Evidence:
     """The evidence for a pose."""
     predicted = proposal.source_overlap, proposal.target_overlap
     return Evidence(
         residual=min(judgement.plane_rmse / judgement.distance, 1.0),
+        coincidence=coincidence,
         sureness=float(np.mean([np.abs(p - 0.5).mean() for p in predicted])),
         stiffness=math.log(max(judgement.stiffness, 1e-6)),
         correction=math.log1p(angle_between(pose, proposal.transform)[0]),

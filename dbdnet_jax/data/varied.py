@@ -22,20 +22,18 @@ def make_varied_pair(
 ) -> Pair:
     """One pair of a shape, as large as the protocol's clouds, everything else drawn more widely.
 
-    The part that a crop leaves is 0.5 to 1 (the denser the shape was sampled, the smaller the
-    part); the crop is by a plane or takes what is nearest to a point on the unit sphere (PRNet,
-    Wang & Solomon 2019); the noise is none or up to three times the protocol's; half of the pairs
-    are disjoint; shapes are larger and smaller by up to a fifth. Motions are the protocol's.
+    The part that a crop leaves is 0.5 to 1: the smaller it is, the more points are drawn before the
+    cut. The crop is by a plane or takes what is nearest to a point on the unit sphere (PRNet, Wang
+    & Solomon 2019). The noise is none or up to three times the protocol's, shapes are larger and
+    smaller by up to a fifth. Half of the pairs are disjoint; these have half of the shape's points
+    for each cloud and keep accordingly more, at least 0.7 where 717 of 2,048 points remain. Motions
+    are the protocol's.
 
     Raises:
         ValueError: two clouds of the protocol's size are more than the shape has.
     """
     total = points.shape[0]
-    if 2 * protocol.size > total:
-        raise ValueError(
-            f"varied pairs of {protocol.size} points need shapes of at least {2 * protocol.size}; "
-            f"got {total}. Lower protocol.points, or set config.data.varied=0."
-        )
+    require_enough_points(total, protocol)
     rows_key, crop_key, motion_key, noise_key, choice_key = jax.random.split(key, 5)
     chance = jax.random.uniform(choice_key, (4,))
     points = points * LARGEST_SCALE ** (2 * chance[0] - 1)
@@ -63,3 +61,12 @@ def make_varied_pair(
     noise = jnp.clip(noise, -protocol.noise_clip, protocol.noise_clip)
     recipe = Recipe(source, target, motion, noise[0], noise[1])
     return assemble(recipe, points, normals, protocol.overlap_radius)
+
+
+def require_enough_points(total: int, protocol: Protocol) -> None:
+    """Raise ValueError where shapes of so many points are too small for disjoint clouds."""
+    if 2 * protocol.size > total:
+        raise ValueError(
+            f"varied pairs of {protocol.size} points need shapes of at least {2 * protocol.size}; "
+            f"got {total}. Lower config.protocol.points, or set config.data.varied=0."
+        )
