@@ -115,7 +115,7 @@ def test_the_frozen_overlap_network_gets_no_key_for_dropout(tmp_path, monkeypatc
     def registered(params, source, target, source_overlap, target_overlap, key=None):
         keys["registration"] = key
 
-    monkeypatch.setattr(stages, "load_best", lambda run_dir: Params({}, None, model))
+    monkeypatch.setattr(stages, "load_best", lambda run_dir, joint: Params({}, None, model))
     monkeypatch.setattr(stages, "predict_overlap_and_matches", predicted)
     monkeypatch.setattr(stages, "register_given_overlap", registered)
     monkeypatch.setattr(stages, "registration_loss", lambda *_: None)
