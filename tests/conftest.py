@@ -32,6 +32,16 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 install_import_hook("dbdnet_jax", "beartype.beartype")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def programs_of_other_modules_are_forgotten():
+    """Every compiled program holds memory maps, of which Linux gives a process 65,530.
+
+    A worker that kept all of them would end in a segmentation fault while compiling.
+    """
+    yield
+    jax.clear_caches()
+
+
 class Tolerance(NamedTuple):
     """``|actual - expected| <= atol + rtol * |expected|``."""
 
