@@ -18,17 +18,17 @@ from pathlib import Path
 from absl import app, flags, logging
 from ml_collections import config_flags
 
-from dbdnet_jax.checkpoint import JOINT, STAGES, load_best
 from dbdnet_jax.drawing.evaluation_page import evaluation_page
-from dbdnet_jax.evaluation import evaluate
-from dbdnet_jax.extras import MissingExtraError, require_drawing
-from dbdnet_jax.files import write_whole
-from dbdnet_jax.model.params import Params
-from dbdnet_jax.programs import keep_compiled_programs
-from dbdnet_jax.report import render, save
-from dbdnet_jax.settings import Settings, parse_flags, read_settings
-from dbdnet_jax.sweep import SWEEP_PAIRS, SWEEPS, render_sweep, save_sweep, sweep
-from dbdnet_jax.weights import PRETRAINED, load_named
+from dbdnet_jax.errors import MissingExtraError, require_drawing
+from dbdnet_jax.evaluation.run import evaluate
+from dbdnet_jax.evaluation.sweep import SWEEP_PAIRS, SWEEPS, render_sweep, save_sweep, sweep
+from dbdnet_jax.evaluation.tables import render, save
+from dbdnet_jax.io.files import write_whole
+from dbdnet_jax.io.programs import keep_compiled_programs
+from dbdnet_jax.networks.params import Params
+from dbdnet_jax.networks.weights import PRETRAINED, load_named
+from dbdnet_jax.training.checkpoint import JOINT, STAGES, load_best
+from dbdnet_jax.training.config import Settings, parse_flags, read_settings
 
 CONFIG = config_flags.DEFINE_config_file("config", None, "Configuration file, configs/NAME.py.")
 RUN_DIR = flags.DEFINE_string("run_dir", None, "The run to score; runs/NAME if not given.")

@@ -17,14 +17,14 @@ import jax
 from absl import app, flags, logging
 from ml_collections import config_flags
 
-from dbdnet_jax.checkpoint import JOINT, STAGES, load_best
-from dbdnet_jax.evaluation import evaluate
-from dbdnet_jax.programs import keep_compiled_programs
-from dbdnet_jax.report import render, save
-from dbdnet_jax.settings import parse_flags, read_settings
-from dbdnet_jax.sources import load_source
-from dbdnet_jax.training import fit
-from dbdnet_jax.weights import save_params
+from dbdnet_jax.evaluation.run import evaluate
+from dbdnet_jax.evaluation.tables import render, save
+from dbdnet_jax.io.programs import keep_compiled_programs
+from dbdnet_jax.networks.weights import save_params
+from dbdnet_jax.training.checkpoint import JOINT, STAGES, load_best
+from dbdnet_jax.training.config import parse_flags, read_settings
+from dbdnet_jax.training.loop import fit
+from dbdnet_jax.training.training_pairs import load_source
 
 CONFIG = config_flags.DEFINE_config_file("config", None, "Configuration file, configs/NAME.py.")
 RUN_DIR = flags.DEFINE_string("run_dir", None, "Where results go; runs/NAME if not given.")

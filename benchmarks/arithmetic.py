@@ -8,8 +8,8 @@ choice of neighbours, norms, exponentials, Sinkhorn's sums. A multiply-add is tw
 
 from itertools import pairwise
 
-from dbdnet_jax.model.config import ModelConfig
-from dbdnet_jax.model.matching import FIT_FEATURES
+from dbdnet_jax.networks.dbdnet.config import ModelConfig
+from dbdnet_jax.networks.dbdnet.matching import FIT_FEATURES
 from dbdnet_jax.ops.pyramid import LEVELS
 
 Layers = tuple[tuple[int, int], ...]

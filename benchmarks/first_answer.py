@@ -40,7 +40,7 @@ def child(way: str) -> None:
     import numpy as np
 
     from dbdnet_jax.alignment.search import ask_network
-    from dbdnet_jax.programs import keep_compiled_programs
+    from dbdnet_jax.io.programs import keep_compiled_programs
 
     keep_compiled_programs()
     params = lap("weights", package.load_pretrained)

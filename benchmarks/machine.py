@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from dbdnet_jax.files import write_whole
+from dbdnet_jax.io.files import write_whole
 
 SIZE = 2048  # of the product that measures the machine
 LIBRARIES = ("jax", "jaxlib", "flax", "optax", "numpy")

@@ -21,18 +21,18 @@ from ml_collections import config_flags
 
 from benchmarks import arithmetic
 from benchmarks.machine import against, compile_timed, matrix_rate, measure, publish, record
-from dbdnet_jax.model.config import ModelConfig
-from dbdnet_jax.model.edgeconv import EdgeConv
-from dbdnet_jax.model.encoder import GROUPS
-from dbdnet_jax.model.params import init_params
+from dbdnet_jax.classical.refine import polish
+from dbdnet_jax.networks.dbdnet.config import ModelConfig
+from dbdnet_jax.networks.dbdnet.encoder import GROUPS
+from dbdnet_jax.networks.edgeconv import EdgeConv
+from dbdnet_jax.networks.params import init_params
 from dbdnet_jax.ops import rigid
 from dbdnet_jax.ops.attention import attention
 from dbdnet_jax.ops.grouping import interpolate, interpolation_weights, knn
 from dbdnet_jax.ops.pyramid import LEVELS
 from dbdnet_jax.ops.sampling import farthest_order
 from dbdnet_jax.ops.sinkhorn import sinkhorn
-from dbdnet_jax.polish import polish
-from dbdnet_jax.settings import parse_flags, read_settings
+from dbdnet_jax.training.config import parse_flags, read_settings
 from dbdnet_jax.types import Cloud
 
 CONFIG = config_flags.DEFINE_config_file("config", None, "Configuration file, configs/NAME.py.")

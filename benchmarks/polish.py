@@ -14,12 +14,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from dbdnet_jax.classical.refine import explore, polish
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.pairs import Protocol, make_pair
-from dbdnet_jax.metrics import motion_errors
+from dbdnet_jax.metrics.pose import motion_errors
 from dbdnet_jax.ops import rigid
 from dbdnet_jax.ops.sampling import random_direction
-from dbdnet_jax.polish import explore, polish
 from dbdnet_jax.types import Pair, Rigid
 
 PROTOCOLS = {"noise": Protocol(), "noise, disjoint": Protocol(disjoint=True)}

@@ -32,15 +32,15 @@ from benchmarks.machine import (
     record,
 )
 from dbdnet_jax.data.cad import cad_split
-from dbdnet_jax.model.dbdnet import register
-from dbdnet_jax.model.params import Params, init_params
-from dbdnet_jax.optimizer import make_optimizer
-from dbdnet_jax.parallel import on_all_devices
-from dbdnet_jax.released import from_released
-from dbdnet_jax.settings import Settings, parse_flags, read_settings
-from dbdnet_jax.sources import Source, shape_source
-from dbdnet_jax.stages import make_task
-from dbdnet_jax.training import init_state, train_step
+from dbdnet_jax.networks.dbdnet.register import register
+from dbdnet_jax.networks.dbdnet.released import from_released
+from dbdnet_jax.networks.params import Params, init_params
+from dbdnet_jax.training.config import Settings, parse_flags, read_settings
+from dbdnet_jax.training.dbdnet import make_task
+from dbdnet_jax.training.loop import init_state, train_step
+from dbdnet_jax.training.optimizer import make_optimizer
+from dbdnet_jax.training.parallel import on_all_devices
+from dbdnet_jax.training.training_pairs import Source, shape_source
 from dbdnet_jax.types import Pair
 
 CONFIG = config_flags.DEFINE_config_file("config", None, "Configuration file, configs/NAME.py.")

@@ -13,10 +13,10 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from dbdnet_jax.align import Alignment, align
+from dbdnet_jax.alignment.align import Alignment, align
 from dbdnet_jax.data.frozen import cad_test_pairs
-from dbdnet_jax.metrics import motion_errors, summarise
-from dbdnet_jax.programs import keep_compiled_programs
+from dbdnet_jax.io.programs import keep_compiled_programs
+from dbdnet_jax.metrics.pose import motion_errors, summarise
 from dbdnet_jax.types import Rigid
 
 FAR = 1e6  # shape radii: map projections of small scenes

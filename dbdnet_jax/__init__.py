@@ -3,12 +3,12 @@
 The public surface is what this module exports; everything else may change.
 """
 
-from dbdnet_jax.align import Alignment, align
-from dbdnet_jax.align_many import MultiAlignment, align_many
-from dbdnet_jax.model.dbdnet import register
-from dbdnet_jax.released import from_released, to_released
+from dbdnet_jax.alignment.align import Alignment, align
+from dbdnet_jax.alignment.align_many import MultiAlignment, align_many
+from dbdnet_jax.networks.dbdnet.register import register
+from dbdnet_jax.networks.dbdnet.released import from_released, to_released
+from dbdnet_jax.networks.weights import load_params, load_pretrained, save_params
 from dbdnet_jax.types import Registration
-from dbdnet_jax.weights import load_params, load_pretrained, save_params
 
 __version__ = "0.1.0"
 __all__ = [

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     import numpy as np
 
-    from dbdnet_jax.align import Alignment
+    from dbdnet_jax.alignment.align import Alignment
 
 ALIGNED, UNSURE, UNUSABLE, INTERRUPTED = 0, 1, 2, 130
 
@@ -106,9 +106,9 @@ def _scale(text: str) -> float | str:
 
 def _settings(options: argparse.Namespace) -> dict:
     """Arguments of `align` that all pairs share; imports what takes time to import."""
-    from dbdnet_jax.alignment.reading import read_transform
-    from dbdnet_jax.programs import keep_compiled_programs
-    from dbdnet_jax.weights import load_named
+    from dbdnet_jax.io.point_files import read_transform
+    from dbdnet_jax.io.programs import keep_compiled_programs
+    from dbdnet_jax.networks.weights import load_named
 
     keep_compiled_programs()
     return {
@@ -124,10 +124,10 @@ def _settings(options: argparse.Namespace) -> dict:
 
 def _jobs(options: argparse.Namespace) -> list[Job]:
     """The pairs that are asked for; their outputs are checked before any work is done."""
-    from dbdnet_jax.writing import TRANSFORM_ENDINGS, check_output
+    from dbdnet_jax.alignment.writing import TRANSFORM_ENDINGS, check_output
 
     if options.report or options.png:
-        from dbdnet_jax.extras import require_drawing
+        from dbdnet_jax.errors import require_drawing
 
         require_drawing()
     outputs = options.output, options.save_aligned, options.report, options.png
@@ -186,9 +186,9 @@ def _run(job: Job, options: argparse.Namespace, settings: dict) -> int:
     """Align one pair, write and print what is asked for; returns its exit status."""
     import json
 
-    from dbdnet_jax.align import align
-    from dbdnet_jax.alignment.reading import read_points
-    from dbdnet_jax.writing import as_json, write_ply, write_transform
+    from dbdnet_jax.alignment.align import align
+    from dbdnet_jax.alignment.writing import as_json, write_ply, write_transform
+    from dbdnet_jax.io.point_files import read_points
 
     print(f"{job.source} -> {job.target} ...", file=sys.stderr)
     try:
@@ -214,7 +214,7 @@ def _draw(
     job: Job, alignment: "Alignment", source: "np.ndarray", target: "np.ndarray", command: str
 ) -> None:
     """Write the page and the picture that are asked for."""
-    from dbdnet_jax.files import write_whole
+    from dbdnet_jax.io.files import write_whole
 
     names = str(job.source), str(job.target)
     if job.report is not None:

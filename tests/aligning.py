@@ -6,9 +6,9 @@ import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dbdnet_jax.align import align
-from dbdnet_jax.model.params import Params, init_params
-from tests.model.small import SMALL
+from dbdnet_jax.alignment.align import align
+from dbdnet_jax.networks.params import Params, init_params
+from tests.networks.dbdnet.small import SMALL
 
 POINTS = 150  # one bucket, hence one compiled program, for every test
 

@@ -9,7 +9,7 @@ import sys
 import flax.linen as nn
 import jax.numpy as jnp
 
-from dbdnet_jax.model import overlap, registration
+from dbdnet_jax.networks.dbdnet import overlap, registration
 
 
 class CoordinateEncoder(nn.Module):

@@ -5,7 +5,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 
-from dbdnet_jax.align import Alignment, Matches
+from dbdnet_jax.alignment.align import Alignment, Matches
 from dbdnet_jax.alignment.success import Evidence
 from tests.aligning import pair
 

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dbdnet_jax.model.params import Params
-from dbdnet_jax.released import from_released
+from dbdnet_jax.networks.dbdnet.released import from_released
+from dbdnet_jax.networks.params import Params
 from dbdnet_jax.types import Cloud, Pair, Rigid
 from tests.conftest import Tolerance
 

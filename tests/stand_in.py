@@ -14,10 +14,10 @@ import numpy as np
 
 from dbdnet_jax.data.pairs import Protocol
 from dbdnet_jax.data.shapes import Shapes
-from dbdnet_jax.settings import TrainSettings
-from dbdnet_jax.sources import Source, shape_source
-from dbdnet_jax.stages import Task
-from dbdnet_jax.training import run_task
+from dbdnet_jax.training.config import TrainSettings
+from dbdnet_jax.training.dbdnet import Task
+from dbdnet_jax.training.loop import run_task
+from dbdnet_jax.training.training_pairs import Source, shape_source
 
 PROTOCOL = Protocol(points=24, keep=0.5)
 EPOCHS, BATCH, RATE = 6.0, 4, 0.1  # 12 steps

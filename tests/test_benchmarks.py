@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from benchmarks import arithmetic, machine
-from dbdnet_jax.model.config import ModelConfig
-from dbdnet_jax.model.dbdnet import register
-from dbdnet_jax.model.params import init_params
-from tests.model.small import SMALL
+from dbdnet_jax.networks.dbdnet.config import ModelConfig
+from dbdnet_jax.networks.dbdnet.register import register
+from dbdnet_jax.networks.params import init_params
+from tests.networks.dbdnet.small import SMALL
 
 N = 64
 LIMITED = dataclasses.replace(

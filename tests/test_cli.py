@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from dbdnet_jax import save_params
-from dbdnet_jax.alignment.reading import read_points, read_transform
+from dbdnet_jax.alignment.writing import write_ply
 from dbdnet_jax.cli import ALIGNED, UNSURE, UNUSABLE, main
-from dbdnet_jax.writing import write_ply
+from dbdnet_jax.io.point_files import read_points, read_transform
 from tests.aligning import POINTS, pair, rotation_error_deg, tiny_align, tiny_params
 
-ALIGN = importlib.import_module("dbdnet_jax.align")  # the package's name may be the function's
+ALIGN = importlib.import_module("dbdnet_jax.alignment.align")  # not the function
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 

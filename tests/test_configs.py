@@ -11,9 +11,9 @@ from ml_collections import ConfigDict
 
 from configs import cad, cad_short, modelnet, threedmatch
 from dbdnet_jax.data.pairs import Protocol
-from dbdnet_jax.losses import LossWeights
-from dbdnet_jax.model.config import ModelConfig
-from dbdnet_jax.settings import Settings, read_settings, stage_record
+from dbdnet_jax.networks.dbdnet.config import ModelConfig
+from dbdnet_jax.training.config import Settings, read_settings, stage_record
+from dbdnet_jax.training.losses import LossWeights
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = {"modelnet": modelnet, "threedmatch": threedmatch, "cad": cad, "cad_short": cad_short}

@@ -10,16 +10,16 @@ import numpy as np
 import pytest
 
 from configs import cad
-from dbdnet_jax import pair_sets
 from dbdnet_jax.data.frozen import cad_test_pairs
 from dbdnet_jax.data.modelnet40 import FILES, load_modelnet40
-from dbdnet_jax.evaluation import evaluate
-from dbdnet_jax.model.config import ModelConfig
-from dbdnet_jax.model.params import Params, parameter_shapes, unflatten
-from dbdnet_jax.pair_sets import load_test_pairs
-from dbdnet_jax.recall import correspondence_rmse_m
-from dbdnet_jax.settings import Settings, read_settings
-from dbdnet_jax.weights import save_params
+from dbdnet_jax.evaluation.run import evaluate
+from dbdnet_jax.metrics.recall import correspondence_rmse_m
+from dbdnet_jax.networks.dbdnet.config import ModelConfig
+from dbdnet_jax.networks.params import Params, parameter_shapes, unflatten
+from dbdnet_jax.networks.weights import save_params
+from dbdnet_jax.training import test_pairs as pair_sets
+from dbdnet_jax.training.config import Settings, read_settings
+from dbdnet_jax.training.test_pairs import load_test_pairs
 from tests.data.test_modelnet40 import LABELS, write_file
 from tests.data.threedmatch_folder import SCENES, write_folder
 

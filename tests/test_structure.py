@@ -10,28 +10,12 @@ PACKAGE = "dbdnet_jax"
 MAX_FILE_LINES = 300
 MAX_FUNCTION_LINES = 60
 
-# A module may import only what stands above it; a new module finds its place here.
-ORDER = """
-types files extras
-ops.rigid ops.sampling ops.grouping ops.normals ops.attention ops.sinkhorn ops.pyramid
-safe_pickle torch_pickle
-model.config model.blocks model.edgeconv model.encoder model.matching model.params model.overlap
-model.registration model.stack model.look model.dbdnet
-losses metrics recall
-data.shapes data.surface data.solids data.household data.furniture data.parts data.procedural
-data.overlap data.symmetry data.pairs data.varied
-data.cad data.modelnet40 data.threedmatch data.frozen
-released weights checkpoint
-baselines.classical
-programs settings sources pair_sets parallel runlog optimizer stages training
-polish evaluation report sweep
-alignment.reading alignment.thinning alignment.judging alignment.search alignment.scene
-alignment.success alignment.verdict alignment.pose_graph
-align align_many writing
-drawing.style drawing.view drawing.figures drawing.page drawing.alignment_page drawing.picture
-drawing.evaluation_page
-cli
-__main__
+# A room, or a file at the top, may import only what stands above it; inside a room no import may
+# lead back to where it came from.
+ROOMS = """
+types errors
+ops io metrics classical networks data training alignment evaluation drawing
+cli __main__
 """.split()
 SCRIPTS = ("train", "evaluate")  # may import the package, not each other
 
@@ -56,40 +40,63 @@ def imported_names(path: Path, root: Path) -> set[str]:
     return names
 
 
-def rank(name: str) -> int | None:
-    """The place of an imported name; None for other libraries and for folders' ``__init__``."""
-    if name.split(".")[0] in SCRIPTS:
-        return len(ORDER)
-    if name.split(".")[0] != PACKAGE:
+def room(name: str) -> str | None:
+    """The room of a dotted name of the package; None for other libraries."""
+    first, *rest = name.split(".")
+    if first in SCRIPTS:
+        return first
+    if first != PACKAGE:
         return None
-    inner = name.removeprefix(PACKAGE).lstrip(".")
-    for place, module in enumerate(ORDER):
-        if inner == module or inner.startswith(module + "."):
-            return place
-    folders = {module.split(".")[0] for module in ORDER if "." in module}
-    if inner in folders:
-        return None
-    return len(ORDER) - 1  # a public name: the package's own __init__, which imports everything
+    # A public name is the package's own __init__, which imports everything.
+    return rest[0] if rest and rest[0] in ROOMS else PACKAGE
+
+
+def rank(name: str) -> int:
+    """The place of a room; public names stand below all of them, and scripts below these."""
+    return (*ROOMS, PACKAGE).index(name) if name not in SCRIPTS else len(ROOMS) + 1
+
+
+def module_of(name: str, modules: set[str]) -> str | None:
+    """The module that an imported name is, or is from."""
+    return next((n for n in (name, name.rpartition(".")[0]) if n in modules), None)
+
+
+def cycles(imports: dict[str, set[str]]) -> list[str]:
+    """Modules that a chain of imports leads back to."""
+    problems = []
+    for start in sorted(imports):
+        reached, waiting = set(), [start]
+        while waiting:
+            new = imports.get(waiting.pop(), set()) - reached
+            reached |= new
+            waiting += new
+        if start in reached:
+            problems.append(f"{start} imports itself by way of others")
+    return problems
 
 
 def back_edges(root: Path) -> list[str]:
-    """Imports of what does not stand above the importing file, and files without a place."""
+    """Imports of what does not stand above the importing file, and files without a room."""
     problems = []
     paths = [root / f"{script}.py" for script in SCRIPTS] + sorted((root / PACKAGE).rglob("*.py"))
-    for path in (path for path in paths if path.exists()):
+    paths = [path for path in paths if path.exists()]
+    modules = {module_name(path, root) for path in paths}
+    inside: dict[str, set[str]] = {}
+    for path in paths:
         name = module_name(path, root)
-        if path.name == "__init__.py" and path.parent.name == PACKAGE:
+        if name == PACKAGE:
             continue
-        inner = name.removeprefix(PACKAGE + ".")
-        if path.name != "__init__.py" and inner not in (*ORDER, *SCRIPTS):
-            problems.append(f"{name} has no place in the import order; add it to ORDER")
+        own = room(name)
+        if own == PACKAGE:
+            problems.append(f"{name} has no room; move it into one of {', '.join(ROOMS)}")
             continue
-        own = 0 if path.name == "__init__.py" else rank(name)
         for imported in sorted(imported_names(path, root)):
-            place = rank(imported)
-            if place is not None and place >= own:
+            theirs = room(imported)
+            if theirs == own:
+                inside.setdefault(name, set()).add(module_of(imported, modules) or imported)
+            elif theirs is not None and rank(theirs) >= rank(own):
                 problems.append(f"{name} imports {imported}, which does not stand above it")
-    return problems
+    return problems + cycles(inside)
 
 
 def too_long(root: Path) -> list[str]:
@@ -135,11 +142,11 @@ def plant(root: Path, name: str, text: str) -> None:
         ("dbdnet_jax/ops/rigid.py", "import dbdnet_jax.losses as losses\n"),
         ("dbdnet_jax/ops/rigid.py", "from ..losses import focal\n"),
         ("dbdnet_jax/ops/rigid.py", "from .. import losses\n"),
-        ("dbdnet_jax/ops/rigid.py", "from dbdnet_jax.ops import sampling\n"),
-        ("dbdnet_jax/ops/rigid.py", "from . import sampling\n"),
+        ("dbdnet_jax/ops/rigid.py", "from dbdnet_jax.ops import rigid\n"),
+        ("dbdnet_jax/ops/rigid.py", "from . import rigid\n"),
         ("dbdnet_jax/ops/rigid.py", "def lazy():\n    from dbdnet_jax.ops.rigid import a\n"),
         ("dbdnet_jax/ops/rigid.py", "from dbdnet_jax import register\n"),
-        ("dbdnet_jax/ops/__init__.py", "from dbdnet_jax.ops.rigid import apply\n"),
+        ("dbdnet_jax/ops/__init__.py", "from dbdnet_jax.data.pairs import make_pair\n"),
         ("dbdnet_jax/cli.py", "import train\n"),
         ("dbdnet_jax/forgotten.py", ""),
         ("train.py", "from evaluate import main\n"),
@@ -150,12 +157,22 @@ def test_a_planted_back_edge_is_caught(tmp_path, name, text):
     assert len(back_edges(tmp_path)) == 1
 
 
+def test_a_planted_circle_in_a_room_is_caught(tmp_path):
+    plant(tmp_path, "dbdnet_jax/ops/a.py", "from dbdnet_jax.ops.b import x\n")
+    plant(tmp_path, "dbdnet_jax/ops/b.py", "def lazy():\n    from dbdnet_jax.ops import c\n")
+    plant(tmp_path, "dbdnet_jax/ops/c.py", "from . import a\n")
+    assert len(back_edges(tmp_path)) == 3
+
+
 @pytest.mark.parametrize(
     ("name", "text"),
     [
         ("dbdnet_jax/__init__.py", "from dbdnet_jax.cli import main\n"),
         ("dbdnet_jax/ops/rigid.py", "import jax\nfrom dbdnet_jax.types import Rigid\n"),
-        ("dbdnet_jax/model/blocks.py", "from ..ops import rigid\nfrom ..ops.rigid import apply\n"),
+        (
+            "dbdnet_jax/networks/blocks.py",
+            "from ..ops import rigid\nfrom ..ops.rigid import apply\n",
+        ),
         ("train.py", "from dbdnet_jax import register\nfrom dbdnet_jax.cli import main\n"),
     ],
 )

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.optimize import minimize
 from tqdm import tqdm
 
-from dbdnet_jax.align import align
+from dbdnet_jax.alignment.align import align
 from dbdnet_jax.alignment.success import (
     SUCCESS_DEG,
     SUCCESS_FILE,
@@ -31,16 +31,16 @@ from dbdnet_jax.alignment.success import success_probability as probability_of
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.frozen import cad_test_pairs
 from dbdnet_jax.data.pairs import Protocol, make_pair
-from dbdnet_jax.files import write_whole
-from dbdnet_jax.model.params import Params
+from dbdnet_jax.io.files import write_whole
+from dbdnet_jax.networks.params import Params
+from dbdnet_jax.networks.weights import load_named
 from dbdnet_jax.types import Pair
-from dbdnet_jax.weights import load_named
 
 VARIANTS = ("noise", "clean", "disjoint")  # of the frozen test pairs, in the order of:
 TEST_PAIRS = 200
 PROTOCOLS = (Protocol(), Protocol(noise_sigma=0.0), Protocol(disjoint=True))
 SEED = 77
-ALIGN = importlib.import_module("dbdnet_jax.align")  # not the function of that name
+ALIGN = importlib.import_module("dbdnet_jax.alignment.align")  # not the function of that name
 FOLDS, BINS = 5, 10
 NOTHING = Coefficients(*(Evidence(*[x] * len(Evidence._fields)) for x in (0.0, 1.0, 0.0)), bias=0.0)
 RIDGE = 1.0  # on the weights of standardised evidence, in units of one pair's loss

@@ -11,10 +11,10 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from dbdnet_jax.alignment.writing import write_ply
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.pairs import Protocol, make_pair
-from dbdnet_jax.files import write_whole
-from dbdnet_jax.writing import write_ply
+from dbdnet_jax.io.files import write_whole
 
 FOLDER = Path(__file__).parents[1] / "examples"
 SHAPE = "corner sofa"

@@ -6,7 +6,7 @@
 Takes the overlap network of the first run and the registration network of the last (those of the
 joint stage where it has run; its pairs count for both networks), scores them on
 the validation pairs and on the frozen test pairs of configs/cad.py, and writes
-dbdnet_jax/pretrained/NAME.npz. Fit the success probability anew afterwards:
+dbdnet_jax/networks/pretrained/NAME.npz. Fit the success probability anew afterwards:
 `python -m tools.fit_success`.
 """
 
@@ -19,14 +19,14 @@ from pathlib import Path
 import jax
 
 from configs import cad
-from dbdnet_jax.checkpoint import STAGES, load_best
 from dbdnet_jax.data.frozen import CAD_VARIANTS, cad_test_pairs
-from dbdnet_jax.evaluation import evaluate_method, from_network
-from dbdnet_jax.model.params import Params
-from dbdnet_jax.settings import read_settings
-from dbdnet_jax.sources import load_source
+from dbdnet_jax.evaluation.run import evaluate_method, from_network
+from dbdnet_jax.networks.params import Params
+from dbdnet_jax.networks.weights import PRETRAINED, load_params, save_params
+from dbdnet_jax.training.checkpoint import STAGES, load_best
+from dbdnet_jax.training.config import read_settings
+from dbdnet_jax.training.training_pairs import load_source
 from dbdnet_jax.types import Pair
-from dbdnet_jax.weights import PRETRAINED, load_params, save_params
 
 
 def main() -> None:

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dbdnet_jax.alignment.reading import MIN_POINTS
+from dbdnet_jax.alignment.downsampling import UNIT_SIZE, Thinned, thin
 from dbdnet_jax.alignment.search import Transform, as_transform, move
-from dbdnet_jax.alignment.thinning import UNIT_SIZE, Thinned, thin
+from dbdnet_jax.io.point_files import MIN_POINTS
 
 Points = Float[np.ndarray, "n 3"]
 OtherPoints = Float[np.ndarray, "m 3"]

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dbdnet_jax import polish
-from dbdnet_jax.alignment.judging import inlier_distance
-from dbdnet_jax.model.dbdnet import register_clouds
-from dbdnet_jax.model.params import Params
-from dbdnet_jax.programs import load_or_trace
+from dbdnet_jax.alignment.quality import inlier_distance
+from dbdnet_jax.classical import refine as polish
+from dbdnet_jax.io.programs import load_or_trace
+from dbdnet_jax.networks.dbdnet.register import register_clouds
+from dbdnet_jax.networks.params import Params
 from dbdnet_jax.types import Cloud, Rigid
 
 Points = Float[np.ndarray, "n 3"]

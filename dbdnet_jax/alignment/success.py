@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dbdnet_jax.alignment.judging import Judgement
+from dbdnet_jax.alignment.quality import Judgement
 from dbdnet_jax.alignment.search import Proposal, Rival, Transform, angle_between
-from dbdnet_jax.weights import PRETRAINED
+from dbdnet_jax.networks.weights import PRETRAINED
 
 SUCCESS_FILE = PRETRAINED / "cad_success.json"
 SUCCESS_DEG = 5.0  # a pose is right when its rotation is off by less
@@ -23,7 +23,7 @@ class Evidence(NamedTuple):
     """What speaks for or against a pose; every entry free of units."""
 
     residual: float  # distance along the normals, root mean square, per inlier distance
-    coincidence: float  # of points that both clouds have in common, see `judging.coincidence`
+    coincidence: float  # of points that both clouds have in common, see `quality.coincidence`
     sureness: float  # mean distance of the overlap probabilities from one half
     stiffness: float  # logarithm of the least held motion's stiffness
     correction: float  # logarithm of 1 + degrees between the network's pose and the refined one

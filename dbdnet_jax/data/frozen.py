@@ -11,7 +11,7 @@ import numpy as np
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.pairs import Protocol, Recipe, assemble, draw_recipe
 from dbdnet_jax.data.shapes import Shapes
-from dbdnet_jax.files import write_whole
+from dbdnet_jax.io.files import write_whole
 from dbdnet_jax.types import Pair, Rigid
 
 NOISE_UNIT = 2.0**-15  # of the stored integers: 3e-5 of a radius, far below any noise of interest

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from dbdnet_jax.files import write_whole
+from dbdnet_jax.io.files import write_whole
 
 
 def nearest_within(

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from dbdnet_jax.data.overlap import nearest_within, overlap_labels
-from dbdnet_jax.torch_pickle import load_pickle, load_torch
+from dbdnet_jax.io.torch_pickle import load_pickle, load_torch
 from dbdnet_jax.types import Cloud, Pair, Rigid
 
 INFO_FILES = {  # the first name that is there; the second is the name in Predator's repository

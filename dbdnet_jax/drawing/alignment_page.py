@@ -5,8 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 from jaxtyping import Float
 
-from dbdnet_jax.align import Alignment
-from dbdnet_jax.alignment.judging import written
+from dbdnet_jax.alignment.align import Alignment
+from dbdnet_jax.alignment.quality import written
 from dbdnet_jax.drawing import figures
 from dbdnet_jax.drawing.page import Markup, card, grid, page, plot, table, tag
 from dbdnet_jax.drawing.style import SOURCE, TARGET

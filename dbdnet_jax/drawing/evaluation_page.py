@@ -11,9 +11,9 @@ from jaxtyping import Float
 from dbdnet_jax.drawing import figures
 from dbdnet_jax.drawing.figures import Curve
 from dbdnet_jax.drawing.page import Markup, card, grid, page, plot, table, tag
-from dbdnet_jax.evaluation import Evaluation, Row
-from dbdnet_jax.report import Table, tables
-from dbdnet_jax.sweep import SWEEPS
+from dbdnet_jax.evaluation.run import Evaluation, Row
+from dbdnet_jax.evaluation.sweep import SWEEPS
+from dbdnet_jax.evaluation.tables import Table, tables
 
 LEAST_DEG, LEAST_UNIT = 1e-2, 1e-4  # where the logarithmic axes begin
 

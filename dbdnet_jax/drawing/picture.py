@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from dbdnet_jax.align import Alignment
+from dbdnet_jax.alignment.align import Alignment
 from dbdnet_jax.drawing.style import BAD, GOOD, OVERLAP, SOURCE, TARGET
 from dbdnet_jax.drawing.view import box, look
 

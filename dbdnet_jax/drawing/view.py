@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dbdnet_jax.align import Alignment
+from dbdnet_jax.alignment.align import Alignment
+from dbdnet_jax.alignment.downsampling import thin
 from dbdnet_jax.alignment.search import move
-from dbdnet_jax.alignment.thinning import thin
 
 MATCHES_DRAWN = 60  # more lines hide each other
 APART = 2.0  # clouds farther apart than this many of their sizes are small dots in one picture

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from dbdnet_jax.data import solids, surface
+from dbdnet_jax.data import surface
+from dbdnet_jax.data.procedural import solids
 from tests import oracle
 from tests.conftest import FLOAT64, assert_close
 

@@ -7,7 +7,7 @@ import pytest
 
 from dbdnet_jax.data.overlap import nearest_within, overlap_labels
 from dbdnet_jax.data.threedmatch import load_correspondences, load_fragment, load_info, load_pair
-from dbdnet_jax.recall import correspondence_rmse_m
+from dbdnet_jax.metrics.recall import correspondence_rmse_m
 from tests.data.threedmatch_folder import (
     ADDRESS,
     SCENES,

@@ -14,7 +14,7 @@ from dbdnet_jax.data.threedmatch import (
     load_info,
     load_pair,
 )
-from dbdnet_jax.recall import correspondence_rmse_m
+from dbdnet_jax.metrics.recall import correspondence_rmse_m
 from tests.data.threedmatch_folder import closer_than, torch_zip, write_folder
 
 

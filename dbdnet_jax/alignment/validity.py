@@ -1,0 +1,60 @@
+"""Whether a pose is to be trusted, and what its user should know: in words."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from jaxtyping import Float
+
+from dbdnet_jax.alignment.quality import Judgement, in_words, written
+from dbdnet_jax.alignment.scene import Scene, size_ratio
+from dbdnet_jax.alignment.search import Proposal, Rival
+
+LOW_OVERLAP, NO_OVERLAP = 0.3, 0.1  # inlier ratios that give a warning, and no valid pose
+UNEQUAL, INCOMPATIBLE = 2.0, 4.0  # sizes of the clouds that do the same
+LINE = 1e-3  # width of what counts as a line, per length
+AS_GOOD = 0.1  # logarithm of a rival's misfit per the pose's: below, they fit alike
+LIKELY = 0.5  # success probability of a valid pose
+
+
+def doubt(scene: Scene, proposal: Proposal, judgement: Judgement, probability: float) -> str:
+    """Why the pose is not to be trusted; "" if it is."""
+    for name, side in (("source", scene.source), ("target", scene.target)):
+        if _is_line(side.sparse):
+            return f"the {name}'s points lie on a line: the rotation about it is free"
+    if size_ratio(scene) > INCOMPATIBLE:
+        return _unequal(scene)
+    if not proposal.valid:
+        return "the network found too few points that the clouds have in common"
+    inliers = judgement.inlier.mean()
+    if inliers < NO_OVERLAP:
+        return f"only {inliers:.0%} of the source comes close to the target"
+    if judgement.free:
+        return f"the surfaces leave free: {in_words(judgement.free)}"
+    if probability < LIKELY:
+        return f"the pose is right with a probability of only {probability:.2f}"
+    return ""
+
+
+def warnings(scene: Scene, judgement: Judgement, rival: Rival) -> Iterator[str]:
+    """What should be known even of a valid pose."""
+    for name, side in (("source", scene.source), ("target", scene.target)):
+        if side.thinned.strays:
+            yield f"{side.thinned.strays} points of the {name}, far from the rest, were left out"
+    if size_ratio(scene) > UNEQUAL:
+        yield _unequal(scene)
+    if (inliers := judgement.inlier.mean()) < LOW_OVERLAP:
+        yield f"low overlap: {inliers:.0%} of the source comes close to the target"
+    if judgement.free:
+        yield f"the surfaces leave free: {in_words(judgement.free)}"
+    if rival.margin < AS_GOOD:
+        turn = f"turned by {rival.angle_deg:.0f} degrees about {written(rival.axis)}"
+        yield f"the clouds fit as well when {turn}: a symmetric shape?"
+
+
+def _unequal(scene: Scene) -> str:
+    return f"the clouds' sizes differ {size_ratio(scene):.1f} : 1; are both in the same unit?"
+
+
+def _is_line(points: Float[np.ndarray, "n 3"]) -> bool:
+    lengths = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(lengths[1] < LINE * lengths[0])

@@ -1,0 +1,72 @@
+"""Results as files: transforms, clouds, and JSON."""
+
+import io
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from dbdnet_jax.alignment.align import Alignment
+from dbdnet_jax.io.files import write_whole
+
+TRANSFORM_ENDINGS = (".txt", ".json", ".npy")
+
+
+def check_output(path: Path, endings: tuple[str, ...]) -> None:
+    """Refuse, before any work is done, a file that could not be written.
+
+    Raises:
+      ValueError: another ending.
+      OSError: no such folder, or it is not writable.
+    """
+    if path.suffix.lower() not in endings:
+        raise ValueError(
+            f"the ending of an output must be one of {' '.join(endings)}; got {path}. Rename it."
+        )
+    if path.is_dir():
+        raise IsADirectoryError(f"an output must be a file; {path} is a folder. Name a file in it.")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(
+            f"the folder of an output must exist; {path.parent} does not. Create it."
+        )
+    if not os.access(path.parent, os.W_OK):
+        raise PermissionError(f"the folder {path.parent} must be writable. Choose another.")
+
+
+def write_transform(path: Path, alignment: Alignment) -> None:
+    """The 4x4 matrix as text or ``.npy``, or everything but the long arrays as ``.json``."""
+    buffer = io.BytesIO()
+    if path.suffix.lower() == ".json":
+        buffer.write((json.dumps(as_json(alignment), indent=2) + "\n").encode())
+    elif path.suffix.lower() == ".npy":
+        np.save(buffer, alignment.transform)
+    else:
+        np.savetxt(buffer, alignment.transform, fmt="%.17g")
+    write_whole(path, buffer.getvalue())
+
+
+def write_ply(path: Path, points: Float[np.ndarray, "n 3"]) -> None:
+    """Points as a binary PLY in float64."""
+    axes = "".join(f"property double {axis}\n" for axis in "xyz")
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n{axes}end_header\n"
+    write_whole(path, head.encode() + np.ascontiguousarray(points, "<f8").tobytes())
+
+
+def as_json(alignment: Alignment) -> dict[str, Any]:
+    """The numbers of an alignment without its long arrays; no NaN and no infinity."""
+    return {
+        "transform": alignment.transform.tolist(),
+        "valid": alignment.valid,
+        "reason": alignment.reason,
+        "success_probability": alignment.success_probability,
+        "warnings": list(alignment.warnings),
+        "inlier_ratio": alignment.inlier_ratio,
+        "inlier_distance": alignment.inlier_distance,
+        "rmse": alignment.rmse if np.isfinite(alignment.rmse) else None,
+        "information": alignment.information.tolist(),
+        "pivot": alignment.pivot.tolist(),
+        "seconds": alignment.timings,
+    }

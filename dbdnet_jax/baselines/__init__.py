@@ -1,1 +1,0 @@
-"""Classical methods to measure against, each (source, target) -> Rigid."""

@@ -1,0 +1,1 @@
+"""Methods without parameters, (source, target) -> transform, and the refinement of a pose."""

@@ -1,0 +1,1 @@
+"""Shapes made by rules: furniture, household objects, machine parts."""

@@ -1,0 +1,1 @@
+"""Methods over test pairs, and the tables of their errors."""

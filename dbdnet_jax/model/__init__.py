@@ -1,1 +1,0 @@
-"""The networks: flax.linen modules that hold parameters and call the operations."""

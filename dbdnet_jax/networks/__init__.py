@@ -1,0 +1,1 @@
+"""The learned methods: layers that they share, their parameters and files of weights."""

@@ -1,0 +1,1 @@
+"""DBDNet: both networks, and `register`."""

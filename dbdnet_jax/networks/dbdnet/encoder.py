@@ -1,0 +1,83 @@
+"""The multi-resolution encoder: four levels that exchange features after every stage."""
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dbdnet_jax.networks.blocks import Exchange
+from dbdnet_jax.networks.edgeconv import EdgeConv
+from dbdnet_jax.ops.grouping import knn
+from dbdnet_jax.ops.pyramid import LEVELS, Pyramid, query_down
+
+GROUPS = (4, 4, 8, 8)  # of the group norms at levels 1 to 4
+
+
+class Encoder(nn.Module):
+    """A point-wise feature of four times ``channels`` (paper, section III-A).
+
+    Stage s holds levels 1 to s and opens the next one by transition-down; in the names, as in
+    the released checkpoints, levels and stages count from 1.
+    """
+
+    channels: int
+    neighbour_space: str
+
+    @nn.compact
+    def __call__(self, points: Float[Array, "n 3"], pyramid: Pyramid) -> Float[Array, "n d"]:
+        """Encode one cloud in farthest-point order; the pyramid may be of the cloud at rest."""
+        history: list[list[jax.Array]] = [[] for _ in range(LEVELS)]
+        features = [points]
+        for stage in range(1, LEVELS + 1):
+            features = [
+                self._edgeconv(f"stage{stage}_conv{level + 1}", x, pyramid, level)
+                for level, x in enumerate(features)
+            ]
+            for level, x in enumerate(features):
+                history[level].append(x)
+            features = self._exchange(f"stage{stage}", features, pyramid)
+        for level, x in enumerate(features):
+            history[level].append(x)
+        fused = [
+            Exchange(self._width(level), name=f"fusion_{level + 1}").down(jnp.concatenate(xs, -1))
+            for level, xs in enumerate(history)
+        ]
+        necks = [
+            Exchange(self.channels, name=f"neck_{level + 1}").up(
+                fused[level], *pyramid.up[0][level - 1]
+            )
+            for level in range(1, LEVELS)
+        ]
+        return jnp.concatenate([fused[0], *necks], axis=-1)
+
+    def _width(self, level: int) -> int:
+        return self.channels << level
+
+    def _edgeconv(self, name: str, x: jax.Array, pyramid: Pyramid, level: int) -> jax.Array:
+        here = pyramid.levels[level]
+        index = here.neighbours
+        if self.neighbour_space == "feature":
+            index = knn(x, x, index.shape[1], here.count)
+        return EdgeConv(self._width(level), GROUPS[level], name=name)(x, index, here.valid)
+
+    def _exchange(self, stage: str, features: list[jax.Array], pyramid: Pyramid) -> list:
+        """Every level adds all others; the next level, if there is one, is opened."""
+        opened = len(features)
+        result = []
+        for level in range(min(opened + 1, LEVELS)):
+            parts = [features[level]] if level < opened else []
+            for other, x in enumerate(features):
+                if other == level:
+                    continue
+                direction = "up" if other > level else "down"
+                name = f"{stage}_{direction}_{other + 1}_{level + 1}"
+                move = Exchange(self._width(level), name=name)
+                if other > level:
+                    parts.append(move.up(x, *pyramid.up[level][other - level - 1]))
+                elif level == opened and other == level - 1:
+                    rows = len(pyramid.levels[level].valid)
+                    parts.append(move.pool(x, pyramid.levels[other].neighbours[:rows]))
+                else:
+                    parts.append(move.down(query_down(x, pyramid, other, level)))
+            result.append(sum(parts[1:], parts[0]))
+        return result

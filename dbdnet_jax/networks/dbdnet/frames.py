@@ -1,0 +1,83 @@
+"""Two clouds as the one stack that the networks see, and the way back to their own frames."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from dbdnet_jax.networks.dbdnet.config import ModelConfig
+from dbdnet_jax.ops import rigid
+from dbdnet_jax.ops.rigid import HIGHEST
+from dbdnet_jax.ops.sampling import farthest_order, inverse_order, prefix_mask, prefix_order
+from dbdnet_jax.types import Cloud, Rigid
+
+
+def grow(x: jax.Array, size: int) -> jax.Array:
+    """Pad the rows of ``x`` with zeros to ``size``."""
+    return jnp.pad(x, [(0, size - x.shape[0])] + [(0, 0)] * (x.ndim - 1))
+
+
+def stack_clouds(source: Cloud, target: Cloud) -> Cloud:
+    """Two clouds of any static sizes as one stack; padding, as everywhere, changes nothing."""
+    size = max(source.points.shape[0], target.points.shape[0])
+    points = jnp.stack([grow(source.points, size), grow(target.points, size)])
+    points = points.astype(jnp.promote_types(points.dtype, jnp.float32))
+    return Cloud(points, jnp.stack([jnp.asarray(source.count), jnp.asarray(target.count)]))
+
+
+def stack_masked(src, tgt, src_mask, tgt_mask) -> tuple[Cloud, Int[Array, "2 n"]]:
+    """Stack two clouds with masks; ``order[c, row]`` is the caller's row of a stacked row."""
+    size = max(src.shape[0], tgt.shape[0])
+    masks = [
+        grow(jnp.ones(x.shape[0], bool) if mask is None else mask, size)
+        for x, mask in ((src, src_mask), (tgt, tgt_mask))
+    ]
+    keep = jnp.stack(masks)
+    order = jax.vmap(prefix_order)(keep)
+    source, target = (Cloud(x, jnp.asarray(x.shape[0])) for x in (src, tgt))
+    points = jnp.take_along_axis(stack_clouds(source, target).points, order[..., None], axis=1)
+    return Cloud(points, jnp.sum(keep, axis=1)), order
+
+
+def prepare(clouds: Cloud, config: ModelConfig, limit: int):
+    """Centre both clouds and bring them into farthest-point order.
+
+    ``limit`` rows are sampled; half of the points where it is 0.
+
+    Returns the clouds, the order, the released code's rows for query-down, and the centroids.
+    What stands in the padding is overwritten, so that it cannot matter from here on.
+    """
+    size = clouds.points.shape[1]
+    valid = jax.vmap(lambda count: prefix_mask(size, count))(clouds.count)[..., None]
+    points = jnp.where(valid, clouds.points, 0.0)
+    centroid = jnp.sum(points, axis=1) / jnp.maximum(clouds.count, 1)[:, None]
+    if config.released:
+        centroid = jnp.zeros_like(centroid)  # departure: the released network sees raw coordinates
+    points = jnp.where(valid, points - centroid[:, None, :], 0.0)
+    fixed = jax.lax.stop_gradient(points), clouds.count
+    order = jax.lax.map(lambda cloud: farthest_order(cloud[0], cloud[1], limit), fixed)
+    ordered = Cloud(jnp.take_along_axis(points, order[..., None], axis=1), clouds.count)
+    skip_rows = jax.vmap(inverse_order)(order) if config.released else None
+    return ordered, order, skip_rows, centroid
+
+
+def first_rows(clouds: Cloud, limit: int) -> Cloud:
+    """The first ``limit`` rows of both clouds; all of them where it is 0."""
+    if not limit:
+        return clouds
+    return Cloud(clouds.points[:, :limit], jnp.minimum(clouds.count, limit))
+
+
+def move_source(clouds: Cloud, motion: Rigid) -> Cloud:
+    """The stacked clouds with the first one moved."""
+    return clouds._replace(points=clouds.points.at[0].set(rigid.apply(motion, clouds.points[0])))
+
+
+def centred(motion: Rigid, centroid: Float[Array, "2 3"]) -> Rigid:
+    """A motion between clouds as one between the same clouds centred."""
+    return uncentred(motion, -centroid)
+
+
+def uncentred(motion: Rigid, centroid: Float[Array, "2 3"]) -> Rigid:
+    """A motion between centred clouds as one between the clouds themselves."""
+    shift = centroid[1] - jnp.matmul(motion.rotation, centroid[0], precision=HIGHEST)
+    return Rigid(motion.rotation, motion.translation + shift)

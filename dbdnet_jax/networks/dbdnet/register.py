@@ -1,0 +1,269 @@
+"""DBDNet as one pure function: two clouds in, one `Registration` out."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from dbdnet_jax.networks.dbdnet.config import ModelConfig
+from dbdnet_jax.networks.dbdnet.frames import (
+    centred,
+    first_rows,
+    grow,
+    move_source,
+    prepare,
+    stack_clouds,
+    stack_masked,
+    uncentred,
+)
+from dbdnet_jax.networks.dbdnet.matching import Matched, soft_targets
+from dbdnet_jax.networks.dbdnet.overlap_pass import look, probability_of_all, view_of
+from dbdnet_jax.networks.dbdnet.registration import RegistrationNetwork
+from dbdnet_jax.networks.params import Params
+from dbdnet_jax.ops import rigid
+from dbdnet_jax.ops.rigid import HIGHEST
+from dbdnet_jax.ops.sampling import inverse_order, prefix_mask, prefix_order
+from dbdnet_jax.types import Branch, Cloud, Registration, Rigid
+
+
+def register(
+    params: Params,
+    src: Float[Array, "n 3"],
+    tgt: Float[Array, "m 3"],
+    src_mask: Bool[Array, " n"] | None = None,
+    tgt_mask: Bool[Array, " m"] | None = None,
+) -> Registration:
+    """Register ``src`` to ``tgt``: no ground truth, no randomness, one static shape.
+
+    Masks say which rows are points (all, if None); what stands in the other rows never matters.
+    Pure, so `jax.jit`, `jax.vmap` and `jax.grad` with respect to the clouds apply (the derivative
+    takes neighbours, sampling, selection and interpolation weights as given). With several
+    `ModelConfig.overlap_passes` both networks take turns, each time on the clouds as aligned so
+    far. Coordinates are expected at the scale the weights were trained at (the unit sphere for the
+    CAD and ModelNet40 weights). Where nothing can be estimated ``valid`` is False and the motion
+    the identity.
+    """
+    if params.registration is None:
+        raise ValueError(
+            "register needs a registration network; these params hold only the overlap network. "
+            "Use predict_overlap, or load a full checkpoint."
+        )
+    clouds, order = stack_masked(src, tgt, src_mask, tgt_mask)
+    sizes = src.shape[0], tgt.shape[0]
+    view = view_of(params.config, clouds)
+    start = rigid.identity(clouds.points.dtype)
+    if params.config.overlap_passes == 1:
+        logits, _ = look(params, view, start)
+        return _register(params, clouds, order, probability_of_all(view, logits), sizes)
+
+    level = clouds._replace(points=clouds.points - view.centroid[:, None, :])
+
+    def look_and_register(motion, _):
+        logits, _ = look(params, view, motion)
+        moved = move_source(level, motion)
+        answer = _register(params, moved, order, probability_of_all(view, logits), sizes)
+        motion = rigid.compose(Rigid(answer.rotation, answer.translation), motion)
+        return motion, (motion, answer)
+
+    _, answers = jax.lax.scan(look_and_register, start, length=params.config.overlap_passes)
+    motion, answer = jax.tree.map(lambda leaf: leaf[-1], answers)
+    motion = _identity_unless(answer.valid, uncentred(motion, view.centroid))
+    branches = (
+        branch._replace(target=branch.target + view.centroid[None, 1])
+        for branch in (answer.rotation_branch, answer.translation_branch)
+    )
+    rotation_branch, translation_branch = branches
+    return answer._replace(
+        rotation=motion.rotation,
+        translation=motion.translation,
+        rotation_branch=rotation_branch,
+        translation_branch=translation_branch,
+    )
+
+
+def register_clouds(params: Params, source: Cloud, target: Cloud) -> Registration:
+    """`register` of two clouds whose points are their first rows."""
+    masks = (prefix_mask(len(cloud.points), cloud.count) for cloud in (source, target))
+    return register(params, source.points, target.points, *masks)
+
+
+def predict_overlap(
+    params: Params,
+    source: Cloud,
+    target: Cloud,
+    dropout_key: PRNGKeyArray | None = None,
+) -> tuple[Float[Array, " n"], Float[Array, " m"]]:
+    """Overlap probabilities of both clouds' points, zero in the padding.
+
+    With a ``dropout_key``, attention weights are dropped as in training.
+    """
+    return predict_overlap_and_matches(params, source, target, dropout_key)[:2]
+
+
+def predict_overlap_and_matches(
+    params: Params,
+    source: Cloud,
+    target: Cloud,
+    dropout_key: PRNGKeyArray | None = None,
+    start: Rigid | None = None,
+) -> tuple[Float[Array, " n"], Float[Array, " m"], Matched | None]:
+    """`predict_overlap`, and the soft matches of a network that has them (else None).
+
+    With a ``start``, a first idea of the motion, one pass from there. Otherwise
+    `ModelConfig.overlap_passes` from the clouds with their centroids aligned, each from the motion
+    that the matches of the one before ask for.
+    """
+    view = view_of(params.config, stack_clouds(source, target))
+
+    def one_pass(motion, _):
+        logits, matched = look(params, view, motion, dropout_key)
+        after = motion if matched is None else centred(matched.motion, view.centroid)
+        return after, (logits, matched)
+
+    passes = params.config.overlap_passes if start is None else 1
+    still = rigid.identity(view.seen.points.dtype)
+    start = still if start is None else centred(start, view.centroid)
+    _, answers = jax.lax.scan(one_pass, start, length=passes)
+    logits, matched = jax.tree.map(lambda leaf: leaf[-1], answers)
+    probability = probability_of_all(view, logits)
+    sizes = source.points.shape[0], target.points.shape[0]
+    return probability[0, : sizes[0]], probability[1, : sizes[1]], matched
+
+
+def register_given_overlap(
+    params: Params,
+    source: Cloud,
+    target: Cloud,
+    source_overlap: Float[Array, " n"],
+    target_overlap: Float[Array, " m"],
+    dropout_key: PRNGKeyArray | None = None,
+) -> Registration:
+    """The registration network alone, on the points whose given overlap passes the threshold.
+
+    Stage 2 of training, and the way to use a mask of one's own: 0 and 1 are probabilities too.
+    """
+    clouds = stack_clouds(source, target)
+    sizes = (source.points.shape[0], target.points.shape[0])
+    size = clouds.points.shape[1]
+    order = jnp.broadcast_to(jnp.arange(size), (2, size))
+    probability = jnp.stack([grow(source_overlap, size), grow(target_overlap, size)])
+    return _register(params, clouds, order, probability, sizes, dropout_key)
+
+
+def select(
+    probability: Float[Array, " n"], count: Int[Array, ""], threshold: float, at_least: int
+) -> tuple[Int[Array, " n"], Int[Array, ""]]:
+    """Row order and count of the points that enter registration.
+
+    The rows above the threshold in their given order or, where fewer than ``at_least`` pass, the
+    ``at_least`` most probable ones in descending order (the released code's rule for a batch of
+    one, here for any batch).
+    """
+    probability = jnp.where(prefix_mask(probability.shape[0], count), probability, -1.0)
+    keep = probability > threshold
+    enough = jnp.sum(keep) >= at_least
+    order = jnp.where(enough, prefix_order(keep), jnp.argsort(-probability, stable=True))
+    return order, jnp.where(enough, jnp.sum(keep), jnp.minimum(at_least, count))
+
+
+def _register(params, clouds, order, probability, sizes, dropout_key=None) -> Registration:
+    """Select, match, solve, and bring everything back to the caller's rows."""
+    config = params.config
+    chosen, count = jax.vmap(
+        lambda p, c: select(p, c, config.overlap_threshold, config.min_points)
+    )(jax.lax.stop_gradient(probability), clouds.count)
+    kept = Cloud(jnp.take_along_axis(clouds.points, chosen[..., None], axis=1), count)
+    motion, correspondence, targets, sampled, solvable = _iterate(params, kept, dropout_key)
+    seen = targets.shape[1]
+    count = jnp.minimum(count, seen)
+    beyond = kept.points.shape[1] - seen
+    correspondence = jnp.pad(correspondence, ((0, 0), (0, beyond), (0, beyond)))
+    targets = jnp.pad(targets, ((0, 0), (0, beyond), (0, 0)))
+    # Row r of the network is row `back[c, r]` of the caller's cloud c.
+    back = jnp.take_along_axis(jnp.take_along_axis(order, chosen, axis=1), sampled, axis=1)
+    from_caller = jax.vmap(inverse_order)(back)
+    rows, columns = from_caller[0, : sizes[0]], from_caller[1, : sizes[1]]
+    branches = [
+        Branch(matrix[rows][:, columns], target[rows], jnp.sum(matrix, axis=1)[rows])
+        for matrix, target in zip(correspondence, targets, strict=True)
+    ]
+    overlap = jnp.take_along_axis(probability, jax.vmap(inverse_order)(order), axis=1)
+    solvable = solvable & jnp.all(count >= 3)
+    motion = _identity_unless(solvable, motion)
+    return Registration(
+        rotation=motion.rotation,
+        translation=motion.translation,
+        src_overlap=overlap[0, : sizes[0]],
+        tgt_overlap=overlap[1, : sizes[1]],
+        src_kept=rows < count[0],
+        tgt_kept=columns < count[1],
+        rotation_branch=branches[0],
+        translation_branch=branches[1],
+        confidence=0.5 * (branches[0].confidence + branches[1].confidence),
+        valid=solvable,
+    )
+
+
+def _identity_unless(valid: Bool[Array, ""], motion: Rigid) -> Rigid:
+    identity = rigid.identity(motion.rotation.dtype)
+    return jax.tree.map(lambda found, rest: jnp.where(valid, found, rest), motion, identity)
+
+
+def _iterate(params: Params, kept: Cloud, dropout_key):
+    """Run the registration network ``config.iterations`` times on the selected clouds.
+
+    Returns the motion, the last correspondences and soft targets of both branches (rows in the
+    network's order), that order, and whether the last solve was determined.
+    """
+    config = params.config
+    network = RegistrationNetwork(config)
+    variables = {"params": params.registration}
+    unmoved = None
+    if config.released:
+        # Departure: features of the unmoved source serve all iterations.
+        ordered, _, skip_rows, _ = prepare(kept, config, 0)
+        unmoved = network.apply(variables, ordered, skip_rows, method="encode")
+
+    def iterate(motion, key):
+        moved = move_source(kept, motion)
+        ordered, order, skip_rows, centroid = prepare(moved, config, config.registration_points)
+        ordered, features = first_rows(ordered, config.registration_points), unmoved
+        if features is None:
+            features = network.apply(variables, ordered, skip_rows, method="encode")
+        matrix = jnp.asarray(network.apply(variables, ordered, features, key, method="match"))
+        increment, targets, solvable = _solve(matrix, ordered, centroid, config)
+        motion = rigid.compose(increment, motion)
+        return motion, (increment, matrix, targets, order, solvable)
+
+    keys = None if dropout_key is None else jax.random.split(dropout_key, config.iterations)
+    start = rigid.identity(kept.points.dtype)
+    motion, steps = jax.lax.scan(iterate, start, keys, length=config.iterations)
+    increment, matrix, targets, order, solvable = jax.tree.map(lambda leaf: leaf[-1], steps)
+    # Departure: the released code returns the last increment instead of the composed motion.
+    return increment if config.released else motion, matrix, targets, order, solvable
+
+
+def _solve(
+    matrix: Float[Array, "2 n n"],
+    ordered: Cloud,
+    centroid: Float[Array, "2 3"],
+    config: ModelConfig,
+) -> tuple[Rigid, Float[Array, "2 n 3"], Bool[Array, ""]]:
+    """R from the first branch's soft correspondences, t from the second's.
+
+    The soft targets are returned in the target's own frame, centring undone.
+    """
+    source, target = ordered.points
+    if config.released:
+        # Departure: not divided by the row's mass, so slack pulls points to the origin, and every
+        # kept row weighs the same.
+        soft = jnp.matmul(matrix, target, precision=HIGHEST)
+        valid = prefix_mask(source.shape[0], ordered.count[0]).astype(source.dtype)
+        weights = jnp.broadcast_to(valid, matrix.shape[:2])
+    else:
+        soft, weights = jax.vmap(soft_targets, in_axes=(0, None))(matrix, target)
+    of_rotation, singular = rigid.procrustes(source, soft[0], weights[0])
+    of_translation, _ = rigid.procrustes(source, soft[1], weights[1])
+    motion = uncentred(Rigid(of_rotation.rotation, of_translation.translation), centroid)
+    finite = jnp.all(jnp.isfinite(motion.rotation)) & jnp.all(jnp.isfinite(motion.translation))
+    determined = (singular[1] > 1e-6) & jnp.all(jnp.sum(weights, axis=1) > 1e-6)
+    return motion, soft + centroid[None, 1:], finite & determined

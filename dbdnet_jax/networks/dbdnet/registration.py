@@ -1,0 +1,122 @@
+"""The registration network: two branches of soft correspondences, one for R and one for t."""
+
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from dbdnet_jax.networks.blocks import Affine, AttentionBlock, DenseNorm, dense, over_clouds
+from dbdnet_jax.networks.dbdnet.config import ModelConfig
+from dbdnet_jax.networks.dbdnet.encoder import Encoder
+from dbdnet_jax.ops.attention import position_code
+from dbdnet_jax.ops.grouping import masked_max, squared_distances
+from dbdnet_jax.ops.pyramid import build_pyramids
+from dbdnet_jax.ops.sampling import prefix_mask
+from dbdnet_jax.ops.sinkhorn import sinkhorn
+from dbdnet_jax.types import Cloud
+
+
+class Affinity(NamedTuple):
+    """How feature distances become affinities: ``-beta (distance^2 - alpha)``, per branch."""
+
+    beta_rotation: Float[Array, ""]
+    alpha_rotation: Float[Array, ""]
+    beta_translation: Float[Array, ""]
+    alpha_translation: Float[Array, ""]
+
+
+class ParameterNetwork(nn.Module):
+    """A PointNet over both clouds, tagged 0 and 1, that sets the branches' affinities."""
+
+    config: ModelConfig
+
+    @nn.compact
+    def __call__(self, clouds: Cloud) -> Affinity:
+        """Four positive numbers from two stacked clouds (RPM-Net, Yew & Lee 2020)."""
+        n = clouds.points.shape[1]
+        tag = jnp.zeros((2, n, 1), clouds.points.dtype).at[1].set(1.0)
+        x = jnp.concatenate([clouds.points, tag], axis=-1).reshape(2 * n, 4)
+        valid = jax.vmap(lambda count: prefix_mask(n, count))(clouds.count).reshape(2 * n)
+        for layer, (features, groups) in enumerate(self.config.point_layers):
+            x = DenseNorm(features, groups, name=f"point_{layer}")(x, valid)
+        x = masked_max(x, valid)[None, :]
+        for layer, (features, groups) in enumerate(self.config.global_layers):
+            x = DenseNorm(features, groups, name=f"global_{layer}")(x, jnp.ones(1, bool))
+        x = nn.softplus(dense(Affine(4, name="linear"), x)[0])
+        return Affinity(x[0], x[1], x[2], x[3])
+
+
+class RegistrationNetwork(nn.Module):
+    """Soft correspondences of both branches (paper, sections III-C and III-D)."""
+
+    config: ModelConfig
+
+    def setup(self):
+        """Declare the encoder, the parameter network and the three stacks of blocks."""
+        config = self.config
+        self.encoder = Encoder(config.registration_channels, config.neighbour_space)
+        self.weight_net = ParameterNetwork(config)
+
+        def stack(size):
+            return [AttentionBlock(config.heads, config.dropout) for _ in range(size)]
+
+        self.attention = stack(config.shared_blocks)
+        self.attention_R = stack(config.rotation_blocks)
+        self.attention_t = stack(config.translation_blocks)
+
+    def __call__(
+        self,
+        clouds: Cloud,
+        skip_rows: Int[Array, "2 n"] | None = None,
+        dropout_key: PRNGKeyArray | None = None,
+    ) -> Float[Array, "2 n n"]:
+        """Encode, then match."""
+        return self.match(clouds, self.encode(clouds, skip_rows), dropout_key)
+
+    def encode(
+        self, clouds: Cloud, skip_rows: Int[Array, "2 n"] | None = None
+    ) -> Float[Array, "2 n d"]:
+        """Point-wise features of two stacked clouds, each in farthest-point order."""
+        pyramids = build_pyramids(clouds, self.config.neighbours, skip_rows)
+        return over_clouds(self.encoder, clouds.points, pyramids)
+
+    def match(
+        self,
+        clouds: Cloud,
+        features: Float[Array, "2 n d"],
+        dropout_key: PRNGKeyArray | None = None,
+    ) -> Float[Array, "2 n n"]:
+        """Correspondences of the rotation branch and of the translation branch.
+
+        Entry [b, i, j] is the mass that source point i gives to target point j in branch b;
+        rows and columns past the counts are zero.
+        """
+        n, width = features.shape[1:]
+        valid = jax.vmap(lambda count: prefix_mask(n, count))(clouds.count)
+        features = features + jax.vmap(lambda x: position_code(x, width))(clouds.points)
+        keys = [None] * 3 if dropout_key is None else jax.random.split(dropout_key, 3)
+        shared = _run(self.attention, features, valid, keys[0])
+        of_rotation = _run(self.attention_R, shared, valid, keys[1])
+        of_translation = _run(self.attention_t, shared, valid, keys[2])
+        scale = self.weight_net(clouds)
+
+        def correspond(x, beta, alpha):
+            affinity = -beta * (squared_distances(x[0], x[1]) - alpha)
+            return jnp.exp(sinkhorn(affinity, *valid, self.config.sinkhorn_iterations))
+
+        return jnp.stack(
+            [
+                correspond(of_rotation, scale.beta_rotation, scale.alpha_rotation),
+                correspond(of_translation, scale.beta_translation, scale.alpha_translation),
+            ]
+        )
+
+
+def _run(blocks, features, valid, key):
+    """One block after another, each with its own dropout key."""
+    keys = [None] * len(blocks) if key is None else jax.random.split(key, len(blocks))
+    for block, block_key in zip(blocks, keys, strict=True):
+        features = block(features, valid, block_key)
+    return features

@@ -1,0 +1,186 @@
+"""Weights on disk: one ``.npz`` file with the arrays, the configuration and a checksum."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import io
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dbdnet_jax.io.files import write_whole
+from dbdnet_jax.io.safe_pickle import CheckpointError
+from dbdnet_jax.networks.dbdnet.config import ModelConfig
+from dbdnet_jax.networks.dbdnet.register import Params
+from dbdnet_jax.networks.dbdnet.released import from_released, to_released
+from dbdnet_jax.networks.params import flatten, parameter_shapes, require_shapes, unflatten
+
+__all__ = [
+    "CheckpointError",
+    "from_released",
+    "load_metadata",
+    "load_params",
+    "load_pretrained",
+    "save_params",
+    "to_released",
+]
+
+PRETRAINED = Path(__file__).parent / "pretrained"
+_FORMAT = 1
+_HEADER, _CHECKSUM = "header", "sha256"
+
+
+def save_params(
+    path: str | Path, params: Params, *, metadata: Mapping[str, Any] | None = None
+) -> None:
+    """Write ``params`` and their configuration to one ``.npz`` file.
+
+    The file appears whole or not at all: an interrupted or failed write leaves what was there.
+
+    Args:
+      path: the file; its folder must exist. An existing file is replaced.
+      params: the parameters; a network that is None is left out.
+      metadata: anything JSON can hold, for people: origin, data, figures.
+
+    Raises:
+      CheckpointError: the arrays do not fit the configuration, or are no floating-point numbers.
+      OSError: the folder is missing, not writable, or full.
+    """
+    arrays = flatten(params)
+    _check(arrays, params.config, "params")
+    header = json.dumps(
+        {
+            "format": _FORMAT,
+            "model": dataclasses.asdict(params.config),
+            "metadata": dict(metadata or {}),
+        },
+        sort_keys=True,
+    )
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(
+            f"The folder of a file of weights must exist; {path.parent} does not. Create it."
+        )
+    members: dict[str, Any] = {_HEADER: header, _CHECKSUM: _checksum(header, arrays), **arrays}
+    buffer = io.BytesIO()
+    np.savez(buffer, **members)
+    write_whole(path, buffer.getbuffer())
+
+
+def load_params(path: str | Path) -> Params:
+    """Read what ``save_params`` wrote.
+
+    Raises:
+      CheckpointError: the file is truncated or altered, has a field or version this release does
+        not know, or arrays that do not fit its configuration.
+      OSError: the file cannot be opened.
+    """
+    header, arrays = _read(path)
+    fields = {field.name for field in dataclasses.fields(ModelConfig)}
+    unknown = sorted(set(header["model"]) - fields)
+    if unknown:
+        raise CheckpointError(
+            f"{path}: every field of the configuration must be known; {', '.join(unknown)} "
+            "is not. Update dbdnet_jax: a newer release wrote the file."
+        )
+    try:
+        config = ModelConfig(**header["model"])
+    except (TypeError, ValueError) as error:
+        raise CheckpointError(f"{path}: the configuration cannot be built: {error}") from error
+    _check(arrays, config, str(path))
+    return unflatten(arrays, config)
+
+
+def load_metadata(path: str | Path) -> dict[str, Any]:
+    """The free-form metadata of a file of weights; errors as in ``load_params``."""
+    return _read(path)[0]["metadata"]
+
+
+def load_pretrained(name: str = "cad") -> Params:
+    """The weights of that name that come with the package.
+
+    Raises:
+      CheckpointError: there are none of that name; those there are, are listed.
+    """
+    available = {file.stem: file for file in sorted(PRETRAINED.glob("*.npz"))}
+    if name not in available:
+        raise CheckpointError(
+            f"name must be one of the weights in {PRETRAINED} ({', '.join(available) or 'none'}); "
+            f"got {name!r}. Train them with `python train.py --config=configs/cad.py` and read "
+            "the result with load_params(path), or read the authors' with from_released(path)."
+        )
+    return load_params(available[name])
+
+
+def load_named(name: str) -> Params:
+    """Weights by the path of a ``.npz`` file, or by their name in the package.
+
+    Raises:
+      FileNotFoundError: no such file.
+      CheckpointError: no such name; otherwise as `load_params`.
+    """
+    if not name.endswith(".npz"):
+        return load_pretrained(name)
+    if not Path(name).exists():
+        raise FileNotFoundError(
+            f"weights must be a .npz file, or a name in the package; there is no file {name}. "
+            "Train first, or give --params=cad."
+        )
+    return load_params(name)
+
+
+def _checksum(header: str, arrays: Mapping[str, np.ndarray]) -> str:
+    """Hash of the header and of every array's name, type, shape and bytes."""
+    digest = hashlib.sha256(header.encode())
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"\n{name} {array.dtype.str} {array.shape}\n".encode())
+        digest.update(array.data)
+    return digest.hexdigest()
+
+
+def _read(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Header and arrays of a file, its checksum verified."""
+    with open(path, "rb") as file:
+        try:
+            with np.load(file, allow_pickle=False) as archive:
+                arrays = {name: archive[name] for name in archive.files}
+            text, checksum = (str(arrays.pop(name)[()]) for name in (_HEADER, _CHECKSUM))
+        except Exception as error:  # NumPy and zipfile answer damage with a dozen types of error
+            raise CheckpointError(
+                f"{path}: the file is truncated, damaged or was not written by save_params "
+                f"({type(error).__name__}: {error}). Fetch it or save it again; a PyTorch "
+                "checkpoint is read by from_released."
+            ) from error
+    if _checksum(text, arrays) != checksum:
+        raise CheckpointError(
+            f"{path}: the content must hash to the sha256 it was saved with, {checksum[:12]}...; "
+            "it was altered or damaged. Fetch it or save it again."
+        )
+    header = json.loads(text)
+    if header["format"] != _FORMAT:
+        raise CheckpointError(
+            f"{path}: the format must be {_FORMAT}; got {header['format']!r}. Update dbdnet_jax."
+        )
+    return header, arrays
+
+
+def _check(arrays: Mapping[str, np.ndarray], config: ModelConfig, owner: str) -> None:
+    """Refuse arrays that are not the parameters of the networks they name."""
+    expected = parameter_shapes(config, {name.split("/")[0] for name in arrays})
+    require_shapes(
+        {name: array.shape for name, array in arrays.items()},
+        expected,
+        owner,
+        "Do configuration and arrays come from the same training?",
+    )
+    wrong = [f"{name} ({array.dtype})" for name, array in arrays.items() if array.dtype.kind != "f"]
+    if wrong or not arrays:
+        raise CheckpointError(
+            f"{owner} must hold float16, float32 or float64 parameters; got "
+            f"{', '.join(wrong) or 'no array'}. Convert them first."
+        )

@@ -1,0 +1,174 @@
+"""Where training gets its pairs: drawn on the device from shapes, or read from disk as scans.
+
+Either way the pairs are a pure function of (seed, step), so a resumed run sees what an unbroken
+one would have seen.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int, PRNGKeyArray
+
+from dbdnet_jax.data.augment import make_varied_pair, require_enough_points
+from dbdnet_jax.data.cad import cad_split
+from dbdnet_jax.data.modelnet40 import load_modelnet40
+from dbdnet_jax.data.pairs import Protocol, make_pair
+from dbdnet_jax.data.procedural.shapes import procedural_shapes
+from dbdnet_jax.data.shapes import Shapes, joined, select
+from dbdnet_jax.io.files import cache_folder
+from dbdnet_jax.training.config import DataSettings, Settings
+from dbdnet_jax.types import Pair
+
+VALIDATION_SEED = 71  # not the run's seed: errors of runs with other seeds compare
+HELD_OUT = 20  # every 20th training shape of a set that has no validation split
+
+
+class Source(NamedTuple):
+    """Pairs without end for training, and a fixed set for validation.
+
+    ``arrays(start)`` yields what step ``start`` and those after it draw from;
+    ``draw(key, number, arrays)`` makes pair ``number`` of the run from it, under jit.
+    """
+
+    epoch_pairs: int
+    arrays: Callable[[int], Iterator[Any]]
+    draw: Callable[[PRNGKeyArray, Int[Array, ""], Any], Pair]
+    validation: Pair  # stacked: every field with a leading axis
+
+
+def load_source(settings: Settings, batch_size: int) -> Source:
+    """The source that ``config.data`` names.
+
+    Raises:
+        FileNotFoundError: its folder, or a file in it, is not there; says where to get it.
+        ValueError: no folder given, a damaged file, or an unknown choice.
+    """
+    if settings.data.name != "cad" and not settings.data.folder:
+        raise ValueError(
+            f"config.data.folder must be where {settings.data.name} stands; it is not set. Give "
+            "--config.data.folder=PATH."
+        )
+    if settings.data.name == "threedmatch":
+        return _scans(settings, batch_size)
+    train, validation = load_training_shapes(settings.data)
+    return shape_source(
+        train,
+        validation,
+        settings.protocol,
+        seed=settings.train.seed,
+        validation_pairs=settings.train.validation_pairs,
+        varied=settings.data.varied,
+    )
+
+
+def load_training_shapes(data: DataSettings) -> tuple[Shapes, Shapes]:
+    """Training and validation shapes. No test shape is among them.
+
+    ModelNet40 has no validation split of its own: every 20th training shape serves as one.
+    """
+    if data.name == "cad":
+        half = None if data.categories == "all" else data.categories
+        train = cad_split("train", half)
+        if data.procedural:
+            train = joined(train, procedural_shapes(data.procedural, seed=0))
+        return train, cad_split("val", half)
+    shapes = load_modelnet40(data.folder, "train", data.categories)
+    held_out = np.arange(len(shapes)) % HELD_OUT == HELD_OUT - 1
+    return select(shapes, ~held_out), select(shapes, held_out)
+
+
+def shape_source(
+    train: Shapes,
+    validation: Shapes,
+    protocol: Protocol,
+    *,
+    seed: int,
+    validation_pairs: int,
+    varied: float = 0.0,
+) -> Source:
+    """Pairs drawn on the device; every epoch sees every shape once, in an order of its own.
+
+    Of the training pairs a share of ``varied`` is drawn by `make_varied_pair`.
+
+    Raises:
+        ValueError: no shape to train or to validate on, or shapes of too few points.
+    """
+    if not len(train) or not len(validation):
+        raise ValueError(
+            "training and validation need at least one shape each; got "
+            f"{len(train)} and {len(validation)}. Choose other config.data.categories."
+        )
+    if varied:
+        require_enough_points(train.points.shape[1], protocol)
+    count = len(train)
+    order_key = jax.random.key(seed)
+
+    def draw(key: PRNGKeyArray, number: Int[Array, ""], points: Any) -> Pair:
+        order = jax.random.permutation(jax.random.fold_in(order_key, number // count), count)
+        shape = points[order[number % count]]
+        normals = jnp.zeros_like(shape)  # nothing trains on them
+        if not varied:
+            return make_pair(key, shape, normals, protocol)
+        choice_key, key = jax.random.split(key)
+        return jax.lax.cond(
+            jax.random.uniform(choice_key) < varied,
+            lambda: make_varied_pair(key, shape, normals, protocol),
+            lambda: make_pair(key, shape, normals, protocol),
+        )
+
+    return Source(
+        epoch_pairs=count,
+        arrays=lambda start: itertools.repeat(train.points),
+        draw=draw,
+        validation=_fixed_pairs(validation, protocol, validation_pairs),
+    )
+
+
+def _fixed_pairs(shapes: Shapes, protocol: Protocol, count: int) -> Pair:
+    """``count`` stacked pairs, the same ones always; shapes in turn."""
+    key = jax.random.key(VALIDATION_SEED)
+    rows = np.arange(count) % len(shapes)
+
+    @jax.jit
+    def draw(numbers: Array, points: Array, normals: Array) -> Pair:
+        return jax.lax.map(
+            lambda args: make_pair(jax.random.fold_in(key, args[0]), args[1], args[2], protocol),
+            (numbers, points, normals),
+        )
+
+    return draw(np.arange(count), shapes.points[rows], shapes.normals[rows])
+
+
+def _scans(settings: Settings, batch_size: int) -> Source:
+    """3DMatch's pairs, read ahead of the step that needs them."""
+    from dbdnet_jax.data.threedmatch import batches, load_info, load_pair
+
+    folder, protocol = settings.data.folder, settings.protocol
+    train, validation = load_info(folder, "train"), load_info(folder, "valid")
+    options: dict[str, Any] = {
+        "points": protocol.points,
+        "radius_m": protocol.overlap_radius,
+        "cache": cache_folder() / "threedmatch",
+    }
+    count = min(settings.train.validation_pairs, len(validation))
+    rows = [i * len(validation) // count for i in range(count)]
+    fixed = [load_pair(folder, validation, i, seed=VALIDATION_SEED, **options) for i in rows]
+    return Source(
+        epoch_pairs=len(train),
+        arrays=lambda start: batches(
+            folder,
+            train,
+            batch_size=batch_size,
+            seed=settings.train.seed,
+            start_step=start,
+            **options,
+        ),
+        draw=lambda key, number, batch: jax.tree.map(lambda x: x[number % batch_size], batch),
+        validation=jax.tree.map(lambda *leaves: np.stack(leaves), *fixed),
+    )

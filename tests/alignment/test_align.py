@@ -1,0 +1,297 @@
+"""`align`: scaling, units, order, initial guesses, what it warns of, and when it refuses."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from dbdnet_jax.alignment.align import Alignment
+from dbdnet_jax.alignment.downsampling import DENSE, UNIT_SIZE, farthest_rows, thin
+from dbdnet_jax.alignment.quality import (
+    UNRELATED,
+    Motion,
+    coincidence,
+    in_words,
+    inlier_distance,
+    judge,
+)
+from dbdnet_jax.alignment.scene import build_scene, is_whole
+from dbdnet_jax.alignment.success import (
+    Coefficients,
+    Evidence,
+    load_coefficients,
+    success_probability,
+)
+from dbdnet_jax.alignment.validity import LIKELY
+from tests.aligning import motion, pair, rotation_error_deg, solid, tiny_align
+from tests.conftest import random_cloud
+
+SOURCE, TARGET, TRUE = pair()
+SAME_DEG = 0.05  # of two runs on the same clouds, otherwise written: float32 inside
+
+
+@pytest.fixture(scope="module")
+def plain() -> Alignment:
+    """The pair as it is, started at the truth: the network is untrained."""
+    return tiny_align(SOURCE, TARGET, initial=TRUE)
+
+
+def assert_same_motion(found, expected, unit: float = 1.0):
+    """Rotations to `SAME_DEG`, and where the source's middle goes to a thousandth of the unit."""
+    assert rotation_error_deg(found, expected) < SAME_DEG
+    middle = np.append(SOURCE.mean(0) * unit, 1)
+    np.testing.assert_allclose((found @ middle)[:3], (expected @ middle)[:3], atol=1e-3 * unit)
+
+
+def test_the_pose_is_found_from_a_near_guess(plain):
+    assert rotation_error_deg(plain.transform, TRUE) < 2.0
+    assert np.linalg.norm(plain.translation - TRUE[:3, 3]) < 0.05
+    assert plain.transform.dtype == np.float64
+    np.testing.assert_allclose(plain.rotation @ plain.rotation.T, np.eye(3), atol=1e-12)
+    assert plain.inlier_ratio > 0.7
+
+
+def test_every_given_point_has_an_overlap_probability(plain):
+    assert plain.source_overlap.shape == (len(SOURCE),)
+    assert plain.target_overlap.shape == (len(TARGET),)
+    assert np.all((plain.source_overlap > 0) & (plain.source_overlap < 1))
+
+
+def test_matches_are_rows_of_the_given_clouds_heaviest_first(plain):
+    assert len(plain.matches.source_rows) > 3
+    assert len(set(plain.matches.source_rows)) == len(plain.matches.source_rows)
+    assert len(set(plain.matches.target_rows)) == len(plain.matches.target_rows)
+    assert plain.matches.source_rows.max() < len(SOURCE)
+    assert np.all(np.diff(plain.matches.confidence) <= 0)
+
+
+def test_inliers_and_rmse_are_what_the_pose_says(plain):
+    moved = SOURCE @ plain.rotation.T + plain.translation
+    distance = cKDTree(TARGET).query(moved)[0]
+    near = distance <= plain.inlier_distance
+    assert plain.inlier_ratio == pytest.approx(near.mean(), abs=0.01)
+    assert plain.rmse == pytest.approx(np.sqrt(np.mean(distance[near] ** 2)), rel=0.02)
+
+
+def test_the_timings_add_up_and_nothing_else_is_random(plain):
+    again = tiny_align(SOURCE, TARGET, initial=TRUE)
+    np.testing.assert_array_equal(again.transform, plain.transform)
+    assert set(plain.timings) == {
+        "read",
+        "weights",
+        "thin",
+        "network",
+        "refine",
+        "judge",
+        "overlap",
+    }
+
+
+@pytest.mark.parametrize(
+    ("unit", "place"),
+    [(1e-6, 0.0), (0.001, 0.0), (1000.0, 0.0), (1e9, 0.0), (1.0, 1e6), (1e3, -1e6)],
+)
+def test_units_and_places_change_nothing_but_the_translation(plain, unit, place):
+    shifts = np.array([1.0, -2.0, 0.5]) * place, np.array([3.0, 1.0, -1.0]) * place
+    guess = TRUE.copy()
+    guess[:3, 3] = unit * TRUE[:3, 3] + shifts[1] - TRUE[:3, :3] @ shifts[0]
+    found = tiny_align(SOURCE * unit + shifts[0], TARGET * unit + shifts[1], initial=guess)
+    expected = plain.transform.copy()
+    expected[:3, 3] = unit * expected[:3, 3]
+    back = found.transform.copy()
+    back[:3, 3] += found.rotation @ shifts[0] - shifts[1]
+    assert_same_motion(back, expected, unit)
+    assert found.rmse == pytest.approx(unit * plain.rmse, rel=0.01)
+    np.testing.assert_allclose(
+        found.pivot - shifts[1], unit * plain.pivot, atol=1e-2 * unit, rtol=0
+    )
+    assert found.success_probability == pytest.approx(plain.success_probability, abs=0.02)
+
+
+@settings(max_examples=5, deadline=None)
+@given(st.integers(0, 2**16))
+def test_the_order_of_the_points_does_not_matter(plain, seed):
+    rng = np.random.default_rng(seed)
+    rows, columns = rng.permutation(len(SOURCE)), rng.permutation(len(TARGET))
+    found = tiny_align(SOURCE[rows], TARGET[columns], initial=TRUE)
+    assert_same_motion(found.transform, plain.transform)
+    np.testing.assert_allclose(found.source_overlap, plain.source_overlap[rows], atol=1e-3)
+
+
+@settings(max_examples=5, deadline=None)
+@given(st.integers(0, 2**16), st.floats(0, 180))
+def test_the_answer_follows_a_moved_source(plain, seed, degrees):
+    extra = motion(seed, degrees)  # old source = extra @ new source
+    rotation, translation = extra[:3, :3], extra[:3, 3]
+    moved = (SOURCE - translation) @ rotation
+    found = tiny_align(moved, TARGET, initial=TRUE @ extra)
+    assert_same_motion(found.transform @ np.linalg.inv(extra), plain.transform)
+
+
+def test_swapping_the_clouds_inverts_the_transform(plain):
+    found = tiny_align(TARGET, SOURCE, initial=np.linalg.inv(TRUE))
+    assert rotation_error_deg(found.transform @ plain.transform, np.eye(4)) < 1.5
+
+
+def test_refinement_is_a_choice():
+    rough = TRUE @ motion(3, 4.0, 0.02)
+    refined = tiny_align(SOURCE, TARGET, initial=rough)
+    raw = tiny_align(SOURCE, TARGET, initial=rough, refine=False)
+    error = [rotation_error_deg(x.transform, TRUE) for x in (refined, raw)]
+    assert error[0] < 2.0 < error[1]
+
+
+def test_the_threshold_becomes_the_networks(monkeypatch):
+    seen = []
+
+    def ask(params, *clouds):
+        seen.append(params.config.overlap_threshold)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("dbdnet_jax.alignment.search.ask_network", ask)
+    with pytest.raises(KeyboardInterrupt):
+        tiny_align(SOURCE, TARGET, overlap_threshold=0.25)
+    assert seen == [0.25]
+
+
+def test_thinning_keeps_shape_and_forgets_density_and_strays():
+    points = solid(200_000, 5)
+    points[0] = 1e6
+    chosen = thin(points, 300)
+    assert 300 < len(chosen.dense) <= DENSE
+    assert chosen.strays == 1 and len(chosen.sparse) == 300
+    assert 0 not in chosen.dense and set(chosen.sparse) <= set(chosen.dense)
+    assert cKDTree(points[chosen.dense]).query(points[1:])[0].max() < 0.05
+    order = np.random.default_rng(0).permutation(len(points))
+    again = thin(points[order], 300)
+    np.testing.assert_array_equal(points[order][again.sparse], points[chosen.sparse])
+
+
+def test_farthest_rows_are_greedy_and_skip_copies():
+    points = random_cloud(3, 30)
+    rows = farthest_rows(np.repeat(points, 3, axis=0), 90) // 3
+    assert sorted(rows) == list(range(30))
+    apart = [cKDTree(points[rows[:i]]).query(points[rows[i]])[0] for i in range(1, 30)]
+    assert np.all(np.diff(apart) <= 1e-12)
+
+
+def test_auto_scale_brings_the_larger_cloud_to_the_weights_size():
+    scene = build_scene(40 * SOURCE, 40 * TARGET, "auto", 150, np.eye(4))
+    norms = [np.linalg.norm(side.sparse, axis=1) for side in (scene.source, scene.target)]
+    assert max(np.quantile(x, 0.98) for x in norms) == pytest.approx(UNIT_SIZE)
+    assert build_scene(SOURCE, TARGET, 2.5, 150, np.eye(4)).factor == 2.5
+
+
+def plane(count: int, seed: int) -> np.ndarray:
+    points = random_cloud(seed, count) * [0.7, 0.7, 0]
+    return points + 0.003 * np.random.default_rng(seed).normal(size=points.shape)
+
+
+def cylinder(count: int, seed: int) -> np.ndarray:
+    x, y, _ = random_cloud(seed, count).T
+    return np.stack([0.3 * np.cos(np.pi * x), 0.3 * np.sin(np.pi * x), y], axis=1)
+
+
+def sphere(count: int, seed: int) -> np.ndarray:
+    points = np.random.default_rng(seed).normal(size=(count, 3))
+    return points / np.linalg.norm(points, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize(
+    ("surface", "words"),
+    [
+        (plane, "translation along every axis normal to [0 0 1] and rotation about [0 0 1]"),
+        (cylinder, "translation along [0 0 1] and rotation about [0 0 1]"),
+        (sphere, "rotation about every axis"),
+        (solid, ""),
+    ],
+)
+def test_free_motions_are_named(surface, words):
+    clouds = surface(3000, 1), surface(3000, 2)
+    judgement = judge(*clouds, inlier_distance(*clouds))
+    assert in_words(tuple(_snap(motion) for motion in judgement.free)) == words
+
+
+def _snap(motion: Motion) -> Motion:
+    """The axis without its last degrees of noise, if it is an axis of the frame."""
+    near = np.abs(motion.direction) < 0.08
+    return motion if near.sum() < 2 else motion._replace(direction=np.where(near, 0, 1.0))
+
+
+def test_information_is_the_curvature_of_the_plane_residuals():
+    clouds = solid(2000, 1), solid(2000, 2)
+    judgement = judge(*clouds, inlier_distance(*clouds))
+    assert np.all(np.linalg.eigvalsh(judgement.information) > 0)
+    # 2000 points that are off by plane_rmse fix a translation to about this, in each direction.
+    sigma = np.sqrt(np.diag(np.linalg.inv(judgement.information))[3:])
+    assert np.all(sigma < 10 * judgement.plane_rmse / np.sqrt(2000))
+
+
+@pytest.mark.parametrize("even", [False, True])
+def test_points_coincide_where_clouds_share_them_in_the_right_pose_only(even):
+    points, others = cylinder(2000, 1), cylinder(2000, 2)
+    if even:
+        points, others = (cloud[farthest_rows(cloud, 1200)] for cloud in (points, others))
+    turn = Rotation.from_rotvec([0, 0, 20], degrees=True).as_matrix()
+    spacing = np.median(cKDTree(points).query(points, k=2)[0][:, 1])
+    noisy = points + random_cloud(3, len(points)) * 0.2 * spacing
+
+    def between(source, target):
+        return coincidence(source, target, inlier_distance(source, target))
+
+    assert between(points, points) == UNRELATED
+    assert between(noisy, points) > 0.3
+    assert between(points @ turn.T, points) < 0.02 and between(others, points) < 0.02
+    assert between(points + 9.0, points) == 0.0
+
+
+def test_clouds_that_a_grid_has_thinned_are_not_asked_whether_points_coincide():
+    few, many = (
+        build_scene(c, c, "auto", 100, np.eye(4)) for c in (solid(500, 1), solid(11_000, 1))
+    )
+    assert is_whole(few) and not is_whole(many)
+    stray = np.vstack([solid(500, 1), [[50.0, 0, 0]]])
+    assert is_whole(build_scene(stray, stray, "auto", 100, np.eye(4)))
+
+
+def test_a_symmetric_shape_is_refused_and_its_motion_named():
+    found = tiny_align(cylinder(400, 1), cylinder(400, 2), initial=np.eye(4))
+    assert not found.valid
+    assert "rotation about" in found.reason
+    assert found.reason in found.warnings
+
+
+def test_clouds_of_different_units_are_refused():
+    found = tiny_align(SOURCE, 10 * TARGET)
+    assert not found.valid
+    assert re.match(r"the clouds' sizes differ (9|10)\.\d : 1; .* same unit", found.reason)
+    assert found.reason in found.warnings
+
+
+def test_a_probability_is_a_logistic_of_standardised_evidence():
+    def evidence(value: float) -> Evidence:
+        return Evidence(*[value] * len(Evidence._fields))
+
+    fitted = Coefficients(evidence(1), evidence(2), evidence(0.5), -1.0)
+    terms = len(Evidence._fields) * 0.5 * (3 - 1) / 2
+    assert success_probability(evidence(3), fitted) == pytest.approx(1 / (1 + np.exp(1 - terms)))
+    assert 0 < success_probability(evidence(-1e9), fitted) < LIKELY
+    assert load_coefficients().bias == load_coefficients().bias  # the shipped file is whole
+
+
+def test_damaged_coefficients_are_named(tmp_path):
+    path = tmp_path / "a.json"
+    path.write_text('{"mean": {}}')
+    with pytest.raises(ValueError, match=r"a\.json must hold.*fit_success"):
+        load_coefficients(path)
+
+
+def test_an_alignment_is_frozen_and_prints_briefly(plain):
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        plain.valid = True
+    assert len(repr(plain)) < 2000

@@ -1,0 +1,286 @@
+"""The step and the loop: the same result however often a run is stopped, and no bad state kept."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from dbdnet_jax.training.checkpoint import Checkpoints
+from dbdnet_jax.training.loop import init_state, train_step
+from dbdnet_jax.training.optimizer import make_optimizer, make_schedule
+from dbdnet_jax.training.parallel import mean_over_pairs, on_all_devices
+from dbdnet_jax.training.runlog import RunLog
+from tests import stand_in
+from tests.conftest import EXACT, FLOAT32, assert_close, assert_finite
+
+STEPS = 12
+
+
+class Stopped(Exception):
+    """What stops a run in a test."""
+
+
+def state_like():
+    """A state with the structure of the stand-in's."""
+    schedule = make_schedule(stand_in.RATE, STEPS, 2)
+    optimizer = make_optimizer(schedule, weight_decay=0.0, clip_norm=1.0)
+    return init_state(stand_in.task().trainable, optimizer, ema_decay=0.9)
+
+
+def final_state(folder: Path):
+    with Checkpoints(folder) as checkpoints:
+        step = checkpoints.latest_step()
+        return step, checkpoints.restore(step, state_like())
+
+
+def assert_same_run(folder: Path, other: Path) -> None:
+    """The same states, bit for bit, and the same curves, byte for byte."""
+    (step, found), (other_step, expected) = final_state(folder), final_state(other)
+    assert step == other_step
+    jax.tree.map(lambda a, b: assert_close(a, b, EXACT), found, expected)
+    for name in ("train.csv", "validation.csv"):
+        assert (folder / name).read_bytes() == (other / name).read_bytes()
+
+
+@pytest.fixture(scope="module")
+def unbroken(tmp_path_factory) -> Path:
+    """The folder of a run that nobody stopped."""
+    folder = tmp_path_factory.mktemp("unbroken")
+    stand_in.train(folder)
+    return folder
+
+
+def test_a_run_leaves_its_curves_and_lowers_the_loss(unbroken):
+    step, state = final_state(unbroken)
+    assert step == int(state.step) == STEPS
+    rows = np.genfromtxt(unbroken / "train.csv", delimiter=",", names=True)
+    assert rows.dtype.names == ("step", "fit", "size", "loss", "gradient_norm", "learning_rate")
+    assert list(rows["step"]) == list(range(1, STEPS + 1))
+    np.testing.assert_allclose(rows["fit"] + rows["size"], rows["loss"], rtol=1e-6)
+    validation = np.genfromtxt(unbroken / "validation.csv", delimiter=",", names=True)
+    assert list(validation["step"]) == [4, 8, 12]
+    assert validation["error"][-1] < validation["error"][0]
+    assert list((unbroken / "tensorboard").glob("events.*"))
+
+
+def test_two_runs_are_the_same_and_a_finished_one_stays(unbroken, tmp_path):
+    stand_in.train(tmp_path)
+    assert_same_run(tmp_path, unbroken)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    stand_in.train(tmp_path)
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+
+
+@pytest.mark.parametrize("stops", [(7,), (1, 3, 4, 11)])
+def test_a_stopped_run_ends_as_an_unbroken_one(unbroken, tmp_path, stops):
+    pairs = stand_in.source()
+    for stop in stops:
+
+        def arrays(start, stop=stop):
+            for step, these in enumerate(pairs.arrays(start), start=start):
+                if step == stop:
+                    raise Stopped
+                yield these
+
+        with pytest.raises(Stopped):
+            stand_in.train(tmp_path, pairs._replace(arrays=arrays))
+    stand_in.train(tmp_path)
+    assert_same_run(tmp_path, unbroken)
+
+
+def test_a_run_killed_again_and_again_ends_as_an_unbroken_one(unbroken, tmp_path):
+    command = [sys.executable, "-m", "tests.stand_in", str(tmp_path)]
+    options = {"cwd": Path(__file__).parents[2], "env": {**os.environ, "JAX_PLATFORMS": "cpu"}}
+    log = tmp_path / "train.csv"
+    for rows in (3, 8):
+        child = subprocess.Popen([*command, "0.1"], stderr=subprocess.DEVNULL, **options)
+        deadline = time.monotonic() + 120
+        while not log.exists() or log.read_text().count("\n") < 1 + rows:
+            assert child.poll() is None and time.monotonic() < deadline
+            time.sleep(0.01)
+        child.send_signal(signal.SIGKILL)
+        assert child.wait() == -signal.SIGKILL
+    subprocess.run([*command, "0"], check=True, capture_output=True, timeout=120, **options)
+    assert_same_run(tmp_path, unbroken)
+
+
+def broken_source(bad: int):
+    """Pairs whose ``bad``-th is NaN, as one damaged shape would make it."""
+    pairs = stand_in.source()
+
+    def draw(key, number, arrays):
+        pair = pairs.draw(key, number, arrays)
+        points = jnp.where(number == bad, jnp.nan, pair.target.points)
+        return pair._replace(target=pair.target._replace(points=points))
+
+    return pairs._replace(draw=draw)
+
+
+@pytest.mark.parametrize("bad_step", [0, 6, 7])
+def test_nan_in_the_data_stops_with_the_last_good_state(unbroken, tmp_path, bad_step):
+    message = rf"'fit' is nan in the step after step {bad_step} .* kept: .*{bad_step or 'none'}"
+    with pytest.raises(FloatingPointError, match=message):
+        stand_in.train(tmp_path, broken_source(bad_step * stand_in.BATCH + 2))
+    with Checkpoints(tmp_path) as checkpoints:
+        assert (checkpoints.latest_step() or 0) == bad_step
+        if bad_step:
+            assert_finite(checkpoints.restore(bad_step, state_like()))
+    stand_in.train(tmp_path)  # the data mended, the run goes on as if nothing had been
+    (_, found), (_, expected) = final_state(tmp_path), final_state(unbroken)
+    jax.tree.map(lambda a, b: assert_close(a, b, EXACT), found, expected)
+
+
+def test_a_gradient_that_is_not_finite_is_named_too(tmp_path):
+    def loss(trainable, frozen, pair, key):
+        terms = stand_in.Terms(jnp.sqrt(jnp.sum(0 * trainable["offset"])), jnp.zeros(()))
+        return terms.fit, terms
+
+    task = stand_in.task()._replace(loss=loss)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stand_in, "task", lambda: task)
+        with pytest.raises(FloatingPointError, match="'gradient_norm' is nan in the step"):
+            stand_in.train(tmp_path)
+
+
+def test_a_validation_that_is_not_finite_stops_too(tmp_path):
+    validation = stand_in.source().validation
+    points = validation.target.points.at[1].set(jnp.inf)
+    validation = validation._replace(target=validation.target._replace(points=points))
+    with pytest.raises(FloatingPointError, match="'error' is .* in the validation after step 4"):
+        stand_in.train(tmp_path, stand_in.source()._replace(validation=validation))
+    with Checkpoints(tmp_path) as checkpoints:
+        assert checkpoints.latest_step() == 4 and checkpoints.best_step() is None
+
+
+def step_once(batch_size: int, ema_decay: float = 0.0, bad: int = -1):
+    """One plain gradient step (rate 1) of the stand-in, from step 3; old state, new, metrics."""
+    pairs = stand_in.source() if bad < 0 else broken_source(bad)
+    optimizer = optax.sgd(1.0)
+    task = stand_in.task()
+    state = init_state(task.trainable, optimizer, ema_decay=ema_decay)
+    state = state.replace(step=jnp.asarray(3, jnp.int32))
+    arguments = (state, None, jax.random.key(0), next(pairs.arrays(0)))
+
+    @jax.jit
+    def step(*arguments):
+        return train_step(
+            *arguments,
+            draw=pairs.draw,
+            loss=task.loss,
+            optimizer=optimizer,
+            batch_size=batch_size,
+            ema_decay=ema_decay,
+        )
+
+    return state, *step(*on_all_devices(arguments))
+
+
+@pytest.mark.parametrize("batch_size", [1, 4, 5])
+def test_a_step_takes_the_mean_gradient_of_its_pairs(batch_size):
+    state, new, metrics = step_once(batch_size)
+    pairs, task = stand_in.source(), stand_in.task()
+    key = jax.random.fold_in(jax.random.key(0), 3)
+    points = jnp.asarray(next(pairs.arrays(0)))
+
+    @jax.jit
+    def one(i):
+        draw_key, loss_key = jax.random.split(jax.random.fold_in(key, i))
+        pair = pairs.draw(draw_key, 3 * batch_size + i, points)
+        return jax.value_and_grad(task.loss, has_aux=True)(task.trainable, None, pair, loss_key)
+
+    found = [one(i) for i in range(batch_size)]
+    losses = [loss for (loss, _), _ in found]
+    gradients = [gradient for _, gradient in found]
+    expected = jax.tree.map(lambda *leaves: sum(leaves) / batch_size, *gradients)
+    assert_close(metrics.loss, np.mean(losses), FLOAT32)
+    assert_close(metrics.gradient_norm, optax.tree.norm(expected), FLOAT32)
+    found = jax.tree.map(lambda old, moved: old - moved, state.params, new.params)
+    jax.tree.map(lambda a, b: assert_close(a, b, FLOAT32), found, expected)
+    assert int(new.step) == 4 and metrics.finite
+
+
+def test_a_bad_step_changes_nothing():
+    state, new, metrics = step_once(4, ema_decay=0.5, bad=3 * 4 + 1)
+    assert not metrics.finite and np.isnan(metrics.terms.fit) and np.isfinite(metrics.terms.size)
+    jax.tree.map(lambda a, b: assert_close(a, b, EXACT), new, state)
+
+
+def test_the_average_has_a_short_memory_at_first():
+    state, new, _ = step_once(4, ema_decay=0.999)
+    decay = (1 + 3) / (10 + 3)
+    expected = jax.tree.map(lambda a, b: decay * a + (1 - decay) * b, state.ema, new.params)
+    jax.tree.map(lambda a, b: assert_close(a, b, FLOAT32), new.ema, expected)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "gpu"])
+@pytest.mark.parametrize("count", [1, 2, 3, 8])
+def test_mean_over_pairs_is_the_mean_on_any_hardware(monkeypatch, backend, count):
+    monkeypatch.setattr(jax, "default_backend", lambda: backend)
+    offset = jnp.asarray([0.5, -1.0])
+
+    def function(i, offset):
+        return {"a": jnp.sin(i * 1.0) + offset, "b": jnp.where(i < count, 1.0, jnp.nan)}
+
+    found = jax.jit(lambda offset: mean_over_pairs(function, count, offset))(offset)
+    expected = np.mean([np.sin(i) + np.asarray(offset) for i in range(count)], axis=0)
+    assert_close(found["a"], expected, FLOAT32)
+    assert_close(found["b"], 1.0, EXACT)
+
+
+def test_the_schedule_warms_up_to_the_peak_and_ends_at_zero():
+    schedule = make_schedule(0.5, 100, 9)
+    rates = np.array([schedule(step) for step in range(101)])
+    np.testing.assert_allclose(rates[:10], 0.5 * np.arange(1, 11) / 10, rtol=1e-6)
+    cosine = 0.25 * (1 + np.cos(np.pi * np.arange(92) / 91))
+    np.testing.assert_allclose(rates[9:], cosine, atol=1e-7)
+    for steps, warmup in ((1, 0), (1, 5), (2, 5), (10, 0)):
+        rates = [float(make_schedule(0.5, steps, warmup)(step)) for step in range(steps)]
+        assert all(0 < rate <= 0.5 for rate in rates)
+
+
+def test_clipping_bounds_the_norm_of_the_gradient():
+    params = {"x": jnp.zeros(4)}
+    gradient = {"x": jnp.asarray([30.0, 40.0, 0.0, 0.0])}
+    for clip_norm, mu in ((0.0, 5.0), (1.0, 0.1)):  # AdamW's first moment: a tenth of it
+        optimizer = make_optimizer(
+            optax.constant_schedule(1e-3), weight_decay=0.0, clip_norm=clip_norm
+        )
+        _, state = optimizer.update(gradient, optimizer.init(params), params)
+        moment = optax.tree_utils.tree_get(state, "mu")["x"]
+        assert_close(jnp.linalg.norm(moment), mu, FLOAT32)
+
+
+def test_each_network_is_clipped_by_its_own_norm():
+    names = ("a", "b")
+    params = {name: {"x": jnp.zeros(2)} for name in names}
+    gradient = {"a": {"x": jnp.asarray([30.0, 40.0])}, "b": {"x": jnp.asarray([0.3, 0.4])}}
+    optimizer = make_optimizer(
+        optax.constant_schedule(1e-3), weight_decay=0.0, clip_norm=1.0, networks=names
+    )
+    _, state = optimizer.update(gradient, optimizer.init(params), params)
+    moments = optax.tree_utils.tree_get(state, "mu")
+    assert_close(jnp.linalg.norm(moments["a"]["x"]), 0.1, FLOAT32)  # a tenth of the limit
+    assert_close(jnp.linalg.norm(moments["b"]["x"]), 0.05, FLOAT32)  # a tenth of its own
+
+
+def test_the_log_drops_what_is_done_again_and_torn_rows(tmp_path):
+    with RunLog(tmp_path, 0) as log:
+        for step in (10, 20, 30):
+            log.write("train", step, {"loss": 1 / step, "rate": 0.1})
+        log.write("validation", 30, {"error": 0.5})
+    whole = (tmp_path / "train.csv").read_text()
+    with (tmp_path / "train.csv").open("a") as file:
+        file.write("4")
+    with RunLog(tmp_path, 20) as log:
+        assert (tmp_path / "train.csv").read_text() == whole[: whole.index("30,")]
+        assert not (tmp_path / "validation.csv").exists()
+        log.write("train", 30, {"loss": 1 / 30, "rate": 0.1})
+    assert (tmp_path / "train.csv").read_text() == whole
