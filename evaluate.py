@@ -18,6 +18,7 @@ from pathlib import Path
 from absl import app, flags, logging
 from ml_collections import config_flags
 
+from dbdnet_jax.data.test_pairs import load_test_pairs
 from dbdnet_jax.drawing.evaluation_page import evaluation_page
 from dbdnet_jax.errors import MissingExtraError, require_drawing
 from dbdnet_jax.evaluation.run import evaluate
@@ -28,7 +29,7 @@ from dbdnet_jax.io.programs import keep_compiled_programs
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import PRETRAINED, load_named
 from dbdnet_jax.training.checkpoint import JOINT, STAGES, load_best
-from dbdnet_jax.training.config import Settings, parse_flags, read_settings
+from dbdnet_jax.training.config import RunConfig, parse_flags, read_config
 
 CONFIG = config_flags.DEFINE_config_file("config", None, "Configuration file, configs/NAME.py.")
 RUN_DIR = flags.DEFINE_string("run_dir", None, "The run to score; runs/NAME if not given.")
@@ -57,10 +58,20 @@ def choose_params(params: str | None, run_dir: str | None, config_name: str) -> 
     return load_named(config_name)
 
 
-def run_sweeps(settings: Settings, params: Params, run_dir: Path) -> None:
+def run_sweeps(config: RunConfig, params: Params, run_dir: Path) -> None:
     """Print and write one table for each sweep asked for."""
     for name in SWEEP.value or ():
-        points = list(sweep(name, settings, params, run_dir, COUNT.value or SWEEP_PAIRS))
+        points = list(
+            sweep(
+                name,
+                config.data,
+                config.protocol,
+                params,
+                run_dir,
+                seed=config.train.seed,
+                count=COUNT.value or SWEEP_PAIRS,
+            )
+        )
         command = shlex.join(["python", *sys.argv])
         print(render_sweep(name, points, command), end="\n\n")
         save_sweep(name, points, run_dir, command)
@@ -82,16 +93,15 @@ def main(argv: list[str]) -> None:
     try:
         if REPORT.value:
             require_drawing()
-        settings = read_settings(CONFIG.value)
+        config = read_config(CONFIG.value)
         params = choose_params(PARAMS.value, RUN_DIR.value, config_name)
         if SWEEP.value:
-            return run_sweeps(settings, params, run_dir)
+            return run_sweeps(config, params, run_dir)
         evaluation = evaluate(
-            settings,
             params,
-            run_dir,
+            load_test_pairs(config.data, config.protocol, run_dir, BENCHMARK.value),
+            seed=config.train.seed,
             command=shlex.join(["python", *sys.argv]),
-            benchmark=BENCHMARK.value,
             count=COUNT.value,
         )
     except (ValueError, OSError, MissingExtraError) as error:

@@ -17,14 +17,15 @@ import jax
 from absl import app, flags, logging
 from ml_collections import config_flags
 
+from dbdnet_jax.data.test_pairs import load_test_pairs
+from dbdnet_jax.data.training_pairs import load_training_pairs
 from dbdnet_jax.evaluation.run import evaluate
 from dbdnet_jax.evaluation.tables import render, save
 from dbdnet_jax.io.programs import keep_compiled_programs
 from dbdnet_jax.networks.weights import save_params
 from dbdnet_jax.training.checkpoint import JOINT, STAGES, load_best
-from dbdnet_jax.training.config import parse_flags, read_settings
+from dbdnet_jax.training.config import parse_flags, read_config
 from dbdnet_jax.training.loop import fit
-from dbdnet_jax.training.training_pairs import load_source
 
 CONFIG = config_flags.DEFINE_config_file("config", None, "Configuration file, configs/NAME.py.")
 RUN_DIR = flags.DEFINE_string("run_dir", None, "Where results go; runs/NAME if not given.")
@@ -43,22 +44,31 @@ def main(argv: list[str]) -> None:
     run_dir = Path(RUN_DIR.value or Path("runs") / Path(config_file).stem)
     stages = STAGES if STAGE.value == "both" else (STAGE.value,)
     try:
-        settings = read_settings(CONFIG.value)
+        config = read_config(CONFIG.value)
         # Before anything asks JAX for a device: the number is fixed from then on. More devices
         # than pairs in a step would have nothing to do.
-        pairs = max(getattr(settings, stage).batch_size for stage in (*STAGES, JOINT))
-        devices = settings.train.devices or min(os.cpu_count() or 1, pairs)
+        pairs = max(getattr(config, stage).batch_size for stage in (*STAGES, JOINT))
+        devices = config.train.devices or min(os.cpu_count() or 1, pairs)
         jax.config.update("jax_num_cpu_devices", devices)
         keep_compiled_programs()
         for stage in stages:
-            source = load_source(settings, getattr(settings, stage).batch_size)
-            fit(settings, stage, run_dir, source)
+            stream = load_training_pairs(
+                config.data,
+                config.protocol,
+                seed=config.train.seed,
+                validation_pairs=config.train.validation_pairs,
+                batch_size=getattr(config, stage).batch_size,
+            )
+            fit(config, stage, run_dir, stream)
         params = load_best(run_dir)
         save_params(run_dir / "params.npz", params)
         print(f"The best weights are in {run_dir / 'params.npz'}.")
         if EVALUATE.value and None not in (params.overlap, params.registration):
             evaluation = evaluate(
-                settings, params, run_dir, command=shlex.join(["python", *sys.argv])
+                params,
+                load_test_pairs(config.data, config.protocol, run_dir),
+                seed=config.train.seed,
+                command=shlex.join(["python", *sys.argv]),
             )
             print(render(evaluation))
             save(evaluation, run_dir)

@@ -25,7 +25,7 @@ from benchmarks.ops import CONFIG, OUT, RUNS, operations
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.dbdnet.register import register
 from dbdnet_jax.networks.params import init_params
-from dbdnet_jax.training.config import parse_flags, read_settings
+from dbdnet_jax.training.config import parse_flags, read_config
 
 PARTS = flags.DEFINE_list("parts", ["256", "512", "1024", "2048", "4096"], "Sizes of the parts.")
 FORWARD = flags.DEFINE_list("forward", ["1024", "2048", "4096"], "Sizes of the whole network.")
@@ -84,7 +84,7 @@ def in_own_process(size: int) -> dict[str, float]:
 def main(argv: list[str]) -> None:
     """Print one JSON object."""
     config = dataclasses.replace(
-        read_settings(CONFIG.value).model, overlap_points=0, registration_points=0
+        read_config(CONFIG.value).model, overlap_points=0, registration_points=0
     )
     if ALONE.value:
         print(json.dumps(whole_network(config, ALONE.value, RUNS.value)))

@@ -32,7 +32,7 @@ from dbdnet_jax.ops.grouping import interpolate, interpolation_weights, knn
 from dbdnet_jax.ops.pyramid import LEVELS
 from dbdnet_jax.ops.sampling import farthest_order
 from dbdnet_jax.ops.sinkhorn import sinkhorn
-from dbdnet_jax.training.config import parse_flags, read_settings
+from dbdnet_jax.training.config import parse_flags, read_config
 from dbdnet_jax.types import Cloud
 
 CONFIG = config_flags.DEFINE_config_file("config", None, "Configuration file, configs/NAME.py.")
@@ -155,16 +155,16 @@ DIFFERENTIATED = ("EdgeConv", "attention", "interpolation", "Sinkhorn", "Procrus
 
 def main(argv: list[str]) -> None:
     """Print one JSON object."""
-    settings = read_settings(CONFIG.value)
+    config = read_config(CONFIG.value)
     rate = matrix_rate()
     figures: dict[str, Any] = {}
-    for name, operation in operations(settings.model, settings.protocol.size).items():
+    for name, operation in operations(config.model, config.protocol.size).items():
         figures[name] = timed(operation, rate, RUNS.value)
         if name.startswith(DIFFERENTIATED):
             figures[f"{name} + derivative"] = timed(with_derivative(operation), rate, RUNS.value)
     found = {
         "matrix_gflop_per_s": round(rate / 1e9, 1),
-        "points": settings.protocol.size,
+        "points": config.protocol.size,
         "operations": figures,
     }
     publish(record("benchmarks.ops", found), OUT.value)

@@ -32,15 +32,15 @@ from benchmarks.machine import (
     record,
 )
 from dbdnet_jax.data.cad import cad_split
+from dbdnet_jax.data.training_pairs import PairStream, pairs_of_shapes
 from dbdnet_jax.networks.dbdnet.register import register
 from dbdnet_jax.networks.dbdnet.released import from_released
 from dbdnet_jax.networks.params import Params, init_params
-from dbdnet_jax.training.config import Settings, parse_flags, read_settings
+from dbdnet_jax.training.config import RunConfig, parse_flags, read_config
 from dbdnet_jax.training.dbdnet import make_task
 from dbdnet_jax.training.loop import init_state, train_step
 from dbdnet_jax.training.optimizer import make_optimizer
 from dbdnet_jax.training.parallel import on_all_devices
-from dbdnet_jax.training.training_pairs import Source, shape_source
 from dbdnet_jax.types import Pair
 
 CONFIG = config_flags.DEFINE_config_file("config", None, "Configuration file, configs/NAME.py.")
@@ -49,25 +49,27 @@ RELEASED = flags.DEFINE_string("released", None, "The authors' checkpoint, for a
 OUT = flags.DEFINE_string("out", None, "File for the record, beside printing it.")
 
 
-def answer(settings: Settings, params: Params, pair: Pair, rate: float) -> dict[str, float]:
+def answer(config: RunConfig, params: Params, pair: Pair, rate: float) -> dict[str, float]:
     """`register` of one pair."""
     arguments = params, pair.source.points, pair.target.points
     program, figures = compile_timed(register, *arguments)
     figures |= measure(lambda: program(*arguments), STEPS.value)
-    count = sum(arithmetic.register(settings.model, settings.protocol.size).values())
+    count = sum(arithmetic.register(config.model, config.protocol.size).values())
     return figures | against(rate, count, figures["median_s"]) | {"peak_gib": peak_gib()}
 
 
-def training_step(settings: Settings, source: Source, stage: str, rate: float) -> dict[str, float]:
+def training_step(
+    config: RunConfig, stream: PairStream, stage: str, rate: float
+) -> dict[str, float]:
     """One stage's step on fresh parameters; registration learns from the true overlap."""
-    task = make_task(settings, stage, "")
-    part, train = getattr(settings, stage), settings.train
+    task = make_task(config, stage, "")
+    part, train = getattr(config, stage), config.train
     optimizer = make_optimizer(
         lambda _: part.learning_rate, weight_decay=train.weight_decay, clip_norm=train.clip_norm
     )
     step = functools.partial(
         train_step,
-        draw=source.draw,
+        draw=stream.draw,
         loss=task.loss,
         optimizer=optimizer,
         batch_size=part.batch_size,
@@ -75,12 +77,12 @@ def training_step(settings: Settings, source: Source, stage: str, rate: float) -
     )
     state = on_all_devices(init_state(task.trainable, optimizer, ema_decay=train.ema_decay))
     # All four, so that the program may be called with what it was compiled for.
-    rest = on_all_devices((task.frozen, jax.random.key(0), next(source.arrays(0))))
+    rest = on_all_devices((task.frozen, jax.random.key(0), next(stream.arrays(0))))
     program, figures = compile_timed(step, state, *rest)
     figures |= measure(lambda: program(state, *rest)[1].loss, STEPS.value)
     seconds = figures["median_s"]
     # Each pass and each iteration is trained for itself.
-    forward = sum(getattr(arithmetic, stage)(settings.model, settings.protocol.size).values())
+    forward = sum(getattr(arithmetic, stage)(config.model, config.protocol.size).values())
     figures |= against(rate, 3 * part.batch_size * forward, seconds)
     return figures | {
         "pairs_per_s": round(part.batch_size / seconds, 2),
@@ -90,29 +92,29 @@ def training_step(settings: Settings, source: Source, stage: str, rate: float) -
 
 def main(argv: list[str]) -> None:
     """Print one JSON object."""
-    config = CONFIG.value
+    overrides = CONFIG.value
     # The benchmark reads no stage's results, so both stages can run on fresh parameters.
-    config.registration.masks = "truth"
-    settings = read_settings(config)
-    jax.config.update("jax_num_cpu_devices", settings.train.devices or os.cpu_count() or 1)
+    overrides.registration.masks = "truth"
+    config = read_config(overrides)
+    jax.config.update("jax_num_cpu_devices", config.train.devices or os.cpu_count() or 1)
     shapes = cad_split("val")
-    source = shape_source(shapes, shapes, settings.protocol, seed=0, validation_pairs=1)
-    pair = jax.tree.map(lambda leaf: np.asarray(leaf)[0], source.validation)
+    stream = pairs_of_shapes(shapes, shapes, config.protocol, seed=0, validation_pairs=1)
+    pair = jax.tree.map(lambda leaf: np.asarray(leaf)[0], stream.validation)
     start = time.perf_counter()
     if RELEASED.value:
-        params = from_released(RELEASED.value, k=settings.model.neighbours)
+        params = from_released(RELEASED.value, k=config.model.neighbours)
     else:
-        params = init_params(jax.random.key(0), settings.model)
+        params = init_params(jax.random.key(0), config.model)
     weights_s = round(time.perf_counter() - start, 3)
     rate = matrix_rate()
     figures = {
         "matrix_gflop_per_s": round(rate / 1e9, 1),
-        "points": settings.protocol.size,
+        "points": config.protocol.size,
         "weights_s": weights_s,
-        "register_one_pair": answer(settings, params, pair, rate),
+        "register_one_pair": answer(config, params, pair, rate),
     }
     for stage in () if RELEASED.value else ("overlap", "registration"):
-        figures[f"{stage}_step"] = training_step(settings, source, stage, rate)
+        figures[f"{stage}_step"] = training_step(config, stream, stage, rate)
     publish(record("benchmarks.step", figures), OUT.value)
 
 

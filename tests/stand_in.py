@@ -14,14 +14,14 @@ import numpy as np
 
 from dbdnet_jax.data.pairs import Protocol
 from dbdnet_jax.data.shapes import Shapes
-from dbdnet_jax.training.config import TrainSettings
+from dbdnet_jax.data.training_pairs import PairStream, pairs_of_shapes
+from dbdnet_jax.training.config import TrainConfig
 from dbdnet_jax.training.dbdnet import Task
 from dbdnet_jax.training.loop import run_task
-from dbdnet_jax.training.training_pairs import Source, shape_source
 
 PROTOCOL = Protocol(points=24, keep=0.5)
 EPOCHS, BATCH, RATE = 6.0, 4, 0.1  # 12 steps
-TRAIN = TrainSettings(
+TRAIN = TrainConfig(
     start="",
     seed=5,
     batch_size=BATCH,
@@ -56,9 +56,9 @@ def shapes(count: int = 8, points: int = 32, seed: int = 0) -> Shapes:
     )
 
 
-def source(train: Shapes | None = None) -> Source:
+def source(train: Shapes | None = None) -> PairStream:
     """Pairs of the random shapes."""
-    return shape_source(
+    return pairs_of_shapes(
         shapes() if train is None else train,
         shapes(2, seed=1),
         PROTOCOL,
@@ -86,20 +86,20 @@ def task() -> Task:
     return Task({"matrix": 0.1 * jnp.ones((3, 3)), "offset": jnp.ones(3)}, None, loss, validate)
 
 
-def train(folder: Path, pairs: Source | None = None, settings: TrainSettings = TRAIN) -> None:
+def train(folder: Path, pairs: PairStream | None = None, config: TrainConfig = TRAIN) -> None:
     """All 12 steps, or those that are left."""
     run_task(
         task(),
         source() if pairs is None else pairs,
         folder,
-        settings,
+        config,
         epochs=EPOCHS,
         batch_size=BATCH,
         learning_rate=RATE,
     )
 
 
-def slowly(pairs: Source, seconds: float) -> Source:
+def slowly(pairs: PairStream, seconds: float) -> PairStream:
     """A source that takes its time, so that there is time to be killed in."""
 
     def arrays(start):

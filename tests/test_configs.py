@@ -12,7 +12,7 @@ from ml_collections import ConfigDict
 from configs import cad, cad_short, modelnet, threedmatch
 from dbdnet_jax.data.pairs import Protocol
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
-from dbdnet_jax.training.config import Settings, read_settings, stage_record
+from dbdnet_jax.training.config import RunConfig, read_config, stage_record
 from dbdnet_jax.training.losses import LossWeights
 
 ROOT = Path(__file__).parents[1]
@@ -46,7 +46,7 @@ def with_change(**changes: object) -> ConfigDict:
 @pytest.mark.parametrize("name", CONFIGS)
 def test_every_configuration_holds_exactly_the_fields_there_are(name):
     config = CONFIGS[name].get_config()
-    assert isinstance(read_settings(config), Settings)
+    assert isinstance(read_config(config), RunConfig)
     for section, record in (("model", ModelConfig), ("protocol", Protocol)):
         assert set(config[section]) == {field.name for field in dataclasses.fields(record)}
 
@@ -58,9 +58,9 @@ def test_configurations_are_locked(name):
 
 
 def test_modelnet_is_the_papers():
-    settings = read_settings(modelnet.get_config())
-    assert settings.model == ModelConfig()  # the released architecture, which a test counts
-    assert settings.protocol == Protocol(
+    config = read_config(modelnet.get_config())
+    assert config.model == ModelConfig()  # the released architecture, which a test counts
+    assert config.protocol == Protocol(
         points=1024,
         keep=0.7,
         max_angle_deg=45.0,
@@ -70,31 +70,31 @@ def test_modelnet_is_the_papers():
         disjoint=False,
         overlap_radius=0.1,
     )
-    assert settings.train.learning_rate == settings.train.weight_decay == 1e-4
-    assert settings.train.warmup_epochs == 5
-    assert settings.train.clip_norm == settings.train.ema_decay == 0
-    assert settings.overlap.gamma == 4
-    assert settings.registration.weights == LossWeights(
+    assert config.train.learning_rate == config.train.weight_decay == 1e-4
+    assert config.train.warmup_epochs == 5
+    assert config.train.clip_norm == config.train.ema_decay == 0
+    assert config.overlap.gamma == 4
+    assert config.registration.weights == LossWeights(
         correspondence=5.0, rotation=1.0, translation=1.0, distance=1.0
     )
-    assert settings.registration.masks == "predicted"
-    for stage in (settings.overlap, settings.registration):
+    assert config.registration.masks == "predicted"
+    for stage in (config.overlap, config.registration):
         assert (stage.epochs, stage.batch_size, stage.learning_rate) == (300, 8, 1e-4)
 
 
 def test_threedmatch_is_the_papers():
-    settings = read_settings(threedmatch.get_config())
-    assert settings.model == ModelConfig()
-    assert (settings.protocol.points, settings.protocol.overlap_radius) == (2048, 0.0375)
-    assert (settings.overlap.epochs, settings.overlap.batch_size) == (150, 2)
-    assert (settings.registration.epochs, settings.registration.batch_size) == (50, 1)
-    assert settings.registration.weights == LossWeights(rotation=5.0)
-    assert settings.overlap.learning_rate == settings.registration.learning_rate == 1e-4
+    config = read_config(threedmatch.get_config())
+    assert config.model == ModelConfig()
+    assert (config.protocol.points, config.protocol.overlap_radius) == (2048, 0.0375)
+    assert (config.overlap.epochs, config.overlap.batch_size) == (150, 2)
+    assert (config.registration.epochs, config.registration.batch_size) == (50, 1)
+    assert config.registration.weights == LossWeights(rotation=5.0)
+    assert config.overlap.learning_rate == config.registration.learning_rate == 1e-4
 
 
 def test_the_cad_configurations_keep_the_papers_protocol():
     for config in (cad, cad_short):
-        assert read_settings(config.get_config()).protocol == Protocol()
+        assert read_config(config.get_config()).protocol == Protocol()
 
 
 def test_stages_follow_the_shared_fields_until_set():
@@ -102,16 +102,16 @@ def test_stages_follow_the_shared_fields_until_set():
     config.train.batch_size = 4
     assert (config.overlap.batch_size, config.registration.batch_size) == (4, 4)
     config.registration.batch_size = 2
-    settings = read_settings(config)
-    assert (settings.overlap.batch_size, settings.registration.batch_size) == (4, 2)
+    config = read_config(config)
+    assert (config.overlap.batch_size, config.registration.batch_size) == (4, 2)
 
 
 def test_a_stage_may_resume_only_with_what_decides_its_outcome():
-    base, other = (read_settings(with_change(registration__epochs=e)) for e in (1.0, 2.0))
+    base, other = (read_config(with_change(registration__epochs=e)) for e in (1.0, 2.0))
     assert stage_record(base, "overlap") == stage_record(other, "overlap")
     assert stage_record(base, "registration") != stage_record(other, "registration")
     assert stage_record(base, "joint") != stage_record(other, "joint")  # its loss is of both
-    more_devices = read_settings(with_change(registration__epochs=1.0, train__devices=3))
+    more_devices = read_config(with_change(registration__epochs=1.0, train__devices=3))
     assert stage_record(base, "registration") == stage_record(more_devices, "registration")
 
 
@@ -133,7 +133,7 @@ def test_a_stage_may_resume_only_with_what_decides_its_outcome():
 )
 def test_a_wrong_configuration_is_refused(changes, message):
     with pytest.raises(ValueError, match=message):
-        read_settings(with_change(**changes))
+        read_config(with_change(**changes))
 
 
 def test_a_missing_field_is_named():
@@ -141,7 +141,7 @@ def test_a_missing_field_is_named():
     with config.unlocked():
         del config.train["seed"]
     with pytest.raises(ValueError, match=r"config must hold|config\.train .* lacks seed"):
-        read_settings(config)
+        read_config(config)
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from configs import cad
+from dbdnet_jax.data import test_pairs
 from dbdnet_jax.data.frozen import cad_test_pairs
 from dbdnet_jax.data.modelnet40 import FILES, load_modelnet40
 from dbdnet_jax.evaluation.run import evaluate
@@ -17,9 +18,7 @@ from dbdnet_jax.metrics.recall import correspondence_rmse_m
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.params import Params, parameter_shapes, unflatten
 from dbdnet_jax.networks.weights import save_params
-from dbdnet_jax.training import test_pairs as pair_sets
-from dbdnet_jax.training.config import Settings, read_settings
-from dbdnet_jax.training.test_pairs import load_test_pairs
+from dbdnet_jax.training.config import RunConfig, read_config
 from tests.data.test_modelnet40 import LABELS, write_file
 from tests.data.threedmatch_folder import SCENES, write_folder
 
@@ -44,10 +43,14 @@ def tiny_params() -> Params:
     return unflatten({name: array.astype(np.float32) for name, array in arrays.items()}, TINY)
 
 
-def cad_settings(**fields) -> Settings:
+def cad_config(**fields) -> RunConfig:
     config = cad.get_config()
     config.update_from_flattened_dict({k.replace("__", "."): v for k, v in fields.items()})
-    return read_settings(config)
+    return read_config(config)
+
+
+def asked_for(config: RunConfig, folder: Path, *benchmark: str) -> test_pairs.PairSet:
+    return test_pairs.load_test_pairs(config.data, config.protocol, folder, *benchmark)
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess:
@@ -65,7 +68,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess:
     ],
 )
 def test_the_packages_frozen_sets_are_used_where_they_fit(fields, variant, tmp_path):
-    found = load_test_pairs(cad_settings(**fields), tmp_path)
+    found = asked_for(cad_config(**fields), tmp_path)
     pairs, digest = cad_test_pairs(variant)
     assert (found.name, found.digest) == (f"cad_test_{variant}", digest)
     assert np.array_equal(found.pairs.source.points, pairs.source.points)
@@ -73,27 +76,27 @@ def test_the_packages_frozen_sets_are_used_where_they_fit(fields, variant, tmp_p
 
 
 def test_another_protocol_is_drawn_once_and_the_same_every_time(tmp_path, monkeypatch):
-    monkeypatch.setattr(pair_sets, "CAD_PAIRS", 4)
-    settings = cad_settings(protocol__points=64, data__categories="unseen")
-    first, again = (load_test_pairs(settings, tmp_path / name) for name in "ab")
+    monkeypatch.setattr(test_pairs, "CAD_PAIRS", 4)
+    config = cad_config(protocol__points=64, data__categories="unseen")
+    first, again = (asked_for(config, tmp_path / name) for name in "ab")
     assert first.name == "cad_test_seen" and first.digest == again.digest
     assert first.pairs.source.points.shape == (4, 45, 3)
     assert [path.name for path in (tmp_path / "a").iterdir()] == ["cad_test_seen.npz"]
-    clean = cad_settings(protocol__points=64, protocol__noise_sigma=0.0, data__categories="unseen")
-    assert load_test_pairs(clean, tmp_path / "a").digest != first.digest
+    clean = cad_config(protocol__points=64, protocol__noise_sigma=0.0, data__categories="unseen")
+    assert asked_for(clean, tmp_path / "a").digest != first.digest
 
 
 def test_modelnet40_has_one_pair_for_every_test_shape_of_the_other_half(tmp_path):
     for split in FILES.values():
         for seed, name in enumerate(split):
             write_file(tmp_path / name, LABELS, seed)
-    settings = cad_settings(
+    config = cad_config(
         data__name="modelnet40",
         data__folder=str(tmp_path),
         data__categories="seen",
         protocol__points=16,
     )
-    found = load_test_pairs(settings, tmp_path / "run")
+    found = asked_for(config, tmp_path / "run")
     assert found.name == "modelnet40_test_unseen"
     assert len(found.pairs.source.count) == len(load_modelnet40(tmp_path, "test", "unseen")) == 4
 
@@ -101,13 +104,13 @@ def test_modelnet40_has_one_pair_for_every_test_shape_of_the_other_half(tmp_path
 def test_scans_are_the_benchmarks_pairs_and_come_without_normals(tmp_path):
     write_folder(tmp_path)
     (tmp_path / "train.pkl").rename(tmp_path / "3DLoMatch.pkl")
-    settings = cad_settings(
+    config = cad_config(
         data__name="threedmatch",
         data__folder=str(tmp_path),
         protocol__points=64,
         protocol__overlap_radius=0.0375,
     )
-    first, again = (load_test_pairs(settings, tmp_path / "run", "3DLoMatch") for _ in range(2))
+    first, again = (asked_for(config, tmp_path / "run", "3DLoMatch") for _ in range(2))
     assert first.name == "3DLoMatch" and first.digest == again.digest
     assert first.pairs.source.points.shape == (3, 64, 3)
     assert not first.pairs.source_normals.any()
@@ -123,7 +126,7 @@ def test_scans_are_the_benchmarks_pairs_and_come_without_normals(tmp_path):
 def test_params_without_a_registration_network_are_refused(tmp_path):
     params = Params(overlap={}, registration=None, config=ModelConfig())
     with pytest.raises(ValueError, match="needs a registration network.*--stage=registration"):
-        evaluate(cad_settings(), params, tmp_path, command="")
+        evaluate(params, asked_for(cad_config(), tmp_path), seed=0, command="")
 
 
 def test_the_script_prints_the_table_and_writes_it(tmp_path):

@@ -5,7 +5,7 @@ python tools/freeze_cad.py
 
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.frozen import CAD_FOLDER, CAD_VARIANTS, freeze
-from dbdnet_jax.training.test_pairs import TEST_SEED
+from dbdnet_jax.data.test_pairs import TEST_SEED
 
 PAIRS = 200
 

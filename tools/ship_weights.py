@@ -20,12 +20,12 @@ import jax
 
 from configs import cad
 from dbdnet_jax.data.frozen import CAD_VARIANTS, cad_test_pairs
+from dbdnet_jax.data.training_pairs import load_training_pairs
 from dbdnet_jax.evaluation.run import evaluate_method, from_network
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import PRETRAINED, load_params, save_params
 from dbdnet_jax.training.checkpoint import STAGES, load_best
-from dbdnet_jax.training.config import read_settings
-from dbdnet_jax.training.training_pairs import load_source
+from dbdnet_jax.training.config import read_config
 from dbdnet_jax.types import Pair
 
 
@@ -40,14 +40,21 @@ def main() -> None:
     if len(options.runs) > 2:
         parser.error(f"give one or two runs; got {len(options.runs)}")
     overlap, registration = (_load(path) for path in (options.runs[0], options.runs[-1]))
-    settings = read_settings(cad.get_config())
-    params = Params(overlap.overlap, registration.registration, settings.model)
+    config = read_config(cad.get_config())
+    params = Params(overlap.overlap, registration.registration, config.model)
+    training = load_training_pairs(
+        config.data,
+        config.protocol,
+        seed=config.train.seed,
+        validation_pairs=config.train.validation_pairs,
+        batch_size=1,
+    )
     metadata = {
-        "protocol": dataclasses.asdict(settings.protocol),
+        "protocol": dataclasses.asdict(config.protocol),
         "pairs_seen": dict(zip(STAGES, options.pairs, strict=True)),
         "note": options.note,
         "shipped_from": subprocess.check_output(["git", "rev-parse", "HEAD"], text=True).strip(),
-        "validation": _figures(params, jax.device_get(load_source(settings, 1).validation)),
+        "validation": _figures(params, jax.device_get(training.validation)),
         "test": {
             variant: {"sha256": digest, **_figures(params, pairs)}
             for variant in CAD_VARIANTS

@@ -4,7 +4,6 @@ import dataclasses
 import os
 import time
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -21,6 +20,7 @@ from dbdnet_jax.classical.open3d import (
     identity,
 )
 from dbdnet_jax.classical.refine import explore
+from dbdnet_jax.data.test_pairs import PairSet
 from dbdnet_jax.errors import MissingExtraError
 from dbdnet_jax.metrics.pose import (
     OverlapSummary,
@@ -36,8 +36,6 @@ from dbdnet_jax.metrics.pose import (
 from dbdnet_jax.metrics.recall import ScanRecall, Scans, correspondence_rmse_m, scan_recall
 from dbdnet_jax.networks.dbdnet.register import register_clouds, register_given_overlap
 from dbdnet_jax.networks.params import Params, init_params
-from dbdnet_jax.training.config import Settings
-from dbdnet_jax.training.test_pairs import load_test_pairs
 from dbdnet_jax.types import Pair, Registration, Rigid
 
 TRUE_NORMALS = "FGR, true normals"
@@ -77,34 +75,28 @@ class Evaluation(NamedTuple):
 
 
 def evaluate(
-    settings: Settings,
-    params: Params,
-    run_dir: str | Path,
-    *,
-    command: str,
-    benchmark: str = "3DMatch",
-    count: int | None = None,
+    params: Params, test: PairSet, *, seed: int, command: str, count: int | None = None
 ) -> Evaluation:
-    """Score the network, itself untrained, and the baselines on the test pairs of ``settings``.
+    """Score the network, itself untrained (from ``seed``), and the baselines on test pairs.
 
     ``count`` keeps the first pairs only, which the name then says (the hash stays that of the
     whole set); ``command`` is what to show as the way to get here.
 
     Raises:
-        ValueError: params without a registration network; otherwise as `load_test_pairs`.
+        ValueError: params without a registration network.
     """
     if params.registration is None:
         raise ValueError(
             "an evaluation needs a registration network; these params hold only the overlap "
             "network. Train it too: python train.py --stage=registration"
         )
-    name, pairs, digest, scans, symmetric = load_test_pairs(settings, run_dir, benchmark)
+    name, pairs, digest, scans, symmetric = test
     if count is not None and count < len(pairs.source.count):
         name = f"{name}_first_{count}"
         pairs = jax.tree.map(lambda leaf: leaf[:count], pairs)
         scans = scans and scans.first(count)
         symmetric = symmetric if symmetric is None else symmetric[:count]
-    methods = make_methods(params, settings.train.seed)
+    methods = make_methods(params, seed)
     if scans is not None:  # the lengths of `polish` are those of a shape in the unit sphere
         methods.pop("DBDNet, polished", None)
     return Evaluation(
@@ -113,7 +105,7 @@ def evaluate(
         pair_set=name,
         pairs=len(pairs.source.count),
         pairs_hash=digest,
-        seed=settings.train.seed,
+        seed=seed,
         command=command,
         device=f"{jax.devices()[0].device_kind}, {os.cpu_count()} cores",
         test_pairs=pairs,

@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 import jax
 
+from dbdnet_jax.data.config import DataConfig
 from dbdnet_jax.data.pairs import Protocol
+from dbdnet_jax.data.test_pairs import load_test_pairs
 from dbdnet_jax.evaluation.run import Row, evaluate_methods, make_methods, possible
 from dbdnet_jax.io.files import write_whole
 from dbdnet_jax.networks.params import Params
-from dbdnet_jax.training.config import Settings
-from dbdnet_jax.training.test_pairs import load_test_pairs
 
 SWEEP_PAIRS = 60  # of each value, unless told otherwise
 NOISE_CLIP = 5.0  # standard deviations, as in the paper's protocol
@@ -67,30 +67,36 @@ class SweepPoint(NamedTuple):
 
 
 def sweep(
-    name: str, settings: Settings, params: Params, run_dir: str | Path, count: int
+    name: str,
+    data: DataConfig,
+    protocol: Protocol,
+    params: Params,
+    folder: str | Path,
+    *,
+    seed: int,
+    count: int,
 ) -> Iterator[SweepPoint]:
     """Score the network and the baselines on ``count`` test pairs for each value of a sweep.
 
-    The pairs are those of the configuration's data set, drawn anew under each protocol from the
-    same seed, so that a pair keeps its shape from one value to the next.
+    The pairs are those of the data set, drawn anew under each protocol from the same seed, so that
+    a pair keeps its shape from one value to the next; ``seed`` is that of untrained weights.
 
     Raises:
         ValueError: scans, whose overlap and motion are given.
     """
-    if settings.data.name == "threedmatch":
+    if data.name == "threedmatch":
         raise ValueError(
             "a sweep needs shapes, from which pairs are drawn; config.data.name is 'threedmatch'. "
             "Use configs/cad.py or configs/modelnet.py."
         )
     methods = {
         name: method
-        for name, method in make_methods(params, settings.train.seed).items()
+        for name, method in make_methods(params, seed).items()
         if name != "identity" and "untrained" not in name
     }
     for value in SWEEPS[name].values:
-        protocol = SWEEPS[name].change(settings.protocol, value)
-        changed = dataclasses.replace(settings, protocol=protocol)
-        pairs = load_test_pairs(changed, Path(run_dir) / "sweep").pairs
+        changed = SWEEPS[name].change(protocol, value)
+        pairs = load_test_pairs(data, changed, Path(folder) / "sweep").pairs
         pairs = jax.tree.map(lambda leaf: leaf[:count], pairs)
         for row in evaluate_methods(possible(methods, pairs), pairs):
             yield SweepPoint(value, row)

@@ -11,46 +11,16 @@ from typing import Any
 
 from ml_collections import ConfigDict
 
+from dbdnet_jax.data.config import DataConfig
 from dbdnet_jax.data.pairs import Protocol
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.training.losses import LossWeights
 
-DATA_SETS = ("cad", "modelnet40", "threedmatch")
 MASKS = ("predicted", "truth", "imperfect")
 
 
 @dataclasses.dataclass(frozen=True)
-class DataSettings:
-    """Which shapes or scans: ``folder`` is where the downloaded sets stand ("" for "cad")."""
-
-    name: str
-    folder: str
-    categories: str  # "all", or one half of the shape classes: "seen" or "unseen"
-    procedural: int = (
-        0  # generated shapes to train on beside those of "cad": 15 ms each, every start
-    )
-    varied: float = 0.0  # share of the training pairs under other conditions than the protocol's
-
-    def __post_init__(self):
-        """Refuse an unknown data set."""
-        if self.name not in DATA_SETS:
-            raise ValueError(
-                f"config.data.name must be one of {DATA_SETS}; got {self.name!r}. Choose one."
-            )
-        if self.procedural < 0 or (self.procedural and self.name != "cad"):
-            raise ValueError(
-                "config.data.procedural must not be negative, and 0 for other data than 'cad'; got "
-                f"{self.procedural} for {self.name!r}. Use 0."
-            )
-        if not 0 <= self.varied <= 1 or (self.varied and self.name == "threedmatch"):
-            raise ValueError(
-                "config.data.varied must be in [0, 1], and 0 for 'threedmatch', whose pairs are "
-                f"read; got {self.varied} for {self.name!r}. Use 0."
-            )
-
-
-@dataclasses.dataclass(frozen=True)
-class TrainSettings:
+class TrainConfig:
     """What all stages share; cadences are in steps, 0 switches clipping and the average off.
 
     ``start`` is a file of weights that the networks in it start from ("": fresh ones).
@@ -85,7 +55,7 @@ class TrainSettings:
 
 
 @dataclasses.dataclass(frozen=True)
-class OverlapSettings:
+class OverlapConfig:
     """Stage 1: the overlap network."""
 
     epochs: float
@@ -99,7 +69,7 @@ class OverlapSettings:
 
 
 @dataclasses.dataclass(frozen=True)
-class RegistrationSettings:
+class RegistrationConfig:
     """Stage 2: the registration network behind the frozen overlap network.
 
     ``masks`` says which points it is given: those that the overlap network "predicted"; those
@@ -123,7 +93,7 @@ class RegistrationSettings:
 
 
 @dataclasses.dataclass(frozen=True)
-class JointSettings:
+class JointConfig:
     """Both networks trained further together, each on what the other one makes of the pair.
 
     The loss is the sum of both stages' losses, with their gamma and weights.
@@ -139,26 +109,26 @@ class JointSettings:
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
+class RunConfig:
     """All of a configuration."""
 
     model: ModelConfig
-    data: DataSettings
+    data: DataConfig
     protocol: Protocol
-    train: TrainSettings
-    overlap: OverlapSettings
-    registration: RegistrationSettings
-    joint: JointSettings
+    train: TrainConfig
+    overlap: OverlapConfig
+    registration: RegistrationConfig
+    joint: JointConfig
 
 
-def read_settings(config: ConfigDict) -> Settings:
+def read_config(config: ConfigDict) -> RunConfig:
     """The records of a configuration.
 
     Raises:
         ValueError: an unknown field (the nearest valid one is named), a missing one, or a value
             that its record refuses.
     """
-    return read_record(Settings, config.to_dict(), "config")
+    return read_record(RunConfig, config.to_dict(), "config")
 
 
 def read_record(record: type, section: Mapping[str, Any], where: str) -> Any:
@@ -192,16 +162,16 @@ def read_record(record: type, section: Mapping[str, Any], where: str) -> Any:
     )
 
 
-def stage_record(settings: Settings, stage: str) -> dict[str, Any]:
+def stage_record(config: RunConfig, stage: str) -> dict[str, Any]:
     """What decides the outcome of a stage, as plain JSON values: a run may resume only with it."""
-    record = dataclasses.asdict(settings)
+    record = dataclasses.asdict(config)
     for name in ("devices", "batch_size", "learning_rate"):  # the stage holds the last two
         del record["train"][name]
     parts = ("overlap", "registration", "joint") if stage == "joint" else (stage,)
     return {name: record[name] for name in ("model", "data", "protocol", "train", *parts)}
 
 
-def _check_stage(name: str, stage: OverlapSettings | RegistrationSettings | JointSettings) -> None:
+def _check_stage(name: str, stage: OverlapConfig | RegistrationConfig | JointConfig) -> None:
     if stage.epochs <= 0 or stage.batch_size < 1:
         raise ValueError(
             f"config.{name} must have epochs > 0 and batch_size >= 1; got epochs={stage.epochs}, "

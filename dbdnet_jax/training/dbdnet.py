@@ -35,7 +35,7 @@ from dbdnet_jax.networks.params import (
 from dbdnet_jax.networks.weights import load_params
 from dbdnet_jax.ops import rigid
 from dbdnet_jax.training.checkpoint import JOINT, STAGES, load_best
-from dbdnet_jax.training.config import Settings
+from dbdnet_jax.training.config import RunConfig
 from dbdnet_jax.training.losses import JointTerms, overlap_loss, registration_loss
 from dbdnet_jax.types import Pair, Registration, Rigid
 
@@ -58,64 +58,64 @@ class Task(NamedTuple):
     networks: tuple[str, ...] = ()
 
 
-def make_task(settings: Settings, stage: str, run_dir: str | Path) -> Task:
+def make_task(config: RunConfig, stage: str, run_dir: str | Path) -> Task:
     """The task of a stage, from fresh parameters.
 
     Raises:
         CheckpointError: "registration" without a trained overlap network in ``run_dir``; "joint"
             without both networks there or in ``config.train.start``.
     """
-    model = settings.model
+    model = config.model
     if stage == JOINT:
-        loss, validate = _joint_functions(settings)
-        return Task(_both_trained(settings, run_dir), None, loss, validate, STAGES)
-    fresh = _first_params(settings)
+        loss, validate = _joint_functions(config)
+        return Task(_both_trained(config, run_dir), None, loss, validate, STAGES)
+    fresh = _first_params(config)
     if stage == "overlap":
-        loss, validate = _overlap_functions(settings)
+        loss, validate = _overlap_functions(config)
         return Task(fresh.overlap, None, loss, validate)
-    loss, validate = _registration_functions(settings)
-    predicted = settings.registration.masks == "predicted"
+    loss, validate = _registration_functions(config)
+    predicted = config.registration.masks == "predicted"
     frozen = _trained_overlap(model, run_dir) if predicted else None
     return Task(fresh.registration, frozen, loss, validate)
 
 
-def _first_params(settings: Settings) -> Params:
+def _first_params(config: RunConfig) -> Params:
     """Fresh parameters, or those of ``config.train.start`` where it holds the network."""
-    fresh = init_params(jax.random.key(settings.train.seed), settings.model)
-    if not settings.train.start:
+    fresh = init_params(jax.random.key(config.train.seed), config.model)
+    if not config.train.start:
         return fresh
-    start = _start_params(settings)
+    start = _start_params(config)
     return Params(
-        start.overlap or fresh.overlap, start.registration or fresh.registration, settings.model
+        start.overlap or fresh.overlap, start.registration or fresh.registration, config.model
     )
 
 
-def _start_params(settings: Settings) -> Params:
+def _start_params(config: RunConfig) -> Params:
     """The networks in ``config.train.start``: one or both, of the configuration's widths."""
-    if not Path(settings.train.start).is_file():
+    if not Path(config.train.start).is_file():
         raise FileNotFoundError(
             "config.train.start must be a file of weights; there is none at "
-            f"{settings.train.start}. Give its path, or '' to start from fresh weights."
+            f"{config.train.start}. Give its path, or '' to start from fresh weights."
         )
-    start = load_params(settings.train.start)
+    start = load_params(config.train.start)
     held = [name for name in STAGES if getattr(start, name) is not None]
     require_shapes(
         {name: array.shape for name, array in flatten(start).items()},
-        parameter_shapes(settings.model, held),
-        f"config.train.start={settings.train.start}",
+        parameter_shapes(config.model, held),
+        f"config.train.start={config.train.start}",
         "Give weights of the same widths as config.model, or set config.train.start=''.",
     )
-    return dataclasses.replace(start, config=settings.model)
+    return dataclasses.replace(start, config=config.model)
 
 
-def _both_trained(settings: Settings, run_dir: str | Path) -> dict[str, Any]:
+def _both_trained(config: RunConfig, run_dir: str | Path) -> dict[str, Any]:
     """Both networks of the run or, where it has none, of ``config.train.start``."""
     params, where = None, str(run_dir)
     if any((Path(run_dir) / stage).is_dir() for stage in STAGES):
         params = load_best(run_dir, joint=False)
-        _require_model(params, settings.model, run_dir)
-    elif settings.train.start:
-        params, where = _start_params(settings), settings.train.start
+        _require_model(params, config.model, run_dir)
+    elif config.train.start:
+        params, where = _start_params(config), config.train.start
     if params is None or params.overlap is None or params.registration is None:
         raise CheckpointError(
             f"the joint stage goes on from two trained networks; {where} does not hold both. Train "
@@ -145,8 +145,8 @@ def _require_model(params: Params, model: ModelConfig, run_dir: str | Path) -> N
         )
 
 
-def _overlap_functions(settings: Settings) -> tuple[LossFunction, Validation]:
-    model, gamma = settings.model, settings.overlap.gamma
+def _overlap_functions(config: RunConfig) -> tuple[LossFunction, Validation]:
+    model, gamma = config.model, config.overlap.gamma
 
     def loss(trainable, frozen, pair, key):
         params = Params(trainable, None, model)
@@ -178,15 +178,15 @@ def _from_anywhere(model: ModelConfig) -> bool:
     return (model.overlap_passes > 1 or model.iterations > 1) and not model.released
 
 
-def _registration_functions(settings: Settings) -> tuple[LossFunction, Validation]:
-    model, stage = settings.model, settings.registration
+def _registration_functions(config: RunConfig) -> tuple[LossFunction, Validation]:
+    model, stage = config.model, config.registration
 
     def given(key, frozen, pair, start):
         if stage.masks == "predicted":
             params = Params(frozen, None, model)
             return predict_overlap_and_matches(params, pair.source, pair.target, start=start)[:2]
         if stage.masks == "imperfect":
-            return imperfect_overlap(key, pair, settings.protocol.overlap_radius)
+            return imperfect_overlap(key, pair, config.protocol.overlap_radius)
         return pair.source_overlap, pair.target_overlap
 
     def answer(trainable, pair, masks, key=None, model=model):
@@ -223,8 +223,8 @@ def _registration_functions(settings: Settings) -> tuple[LossFunction, Validatio
     return loss, validate
 
 
-def _joint_functions(settings: Settings) -> tuple[LossFunction, Validation]:
-    model, gamma, weights = settings.model, settings.overlap.gamma, settings.registration.weights
+def _joint_functions(config: RunConfig) -> tuple[LossFunction, Validation]:
+    model, gamma, weights = config.model, config.overlap.gamma, config.registration.weights
     one = dataclasses.replace(model, iterations=1) if _from_anywhere(model) else model
 
     def turn(networks, pair, start, dropout_key=None):

@@ -22,13 +22,13 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from dbdnet_jax.data.training_pairs import PairStream
 from dbdnet_jax.training.checkpoint import Checkpoints, write_stage
-from dbdnet_jax.training.config import Settings, TrainSettings, stage_record
+from dbdnet_jax.training.config import RunConfig, TrainConfig, stage_record
 from dbdnet_jax.training.dbdnet import LossFunction, Task, make_task
 from dbdnet_jax.training.optimizer import make_optimizer, make_schedule
 from dbdnet_jax.training.parallel import mean_over_pairs, on_all_devices
 from dbdnet_jax.training.runlog import RunLog
-from dbdnet_jax.training.training_pairs import Source
 from dbdnet_jax.types import Pair
 
 
@@ -104,7 +104,7 @@ def train_step(
     return state, StepMetrics(total, terms, norm, finite)
 
 
-def fit(settings: Settings, stage: str, run_dir: str | Path, source: Source) -> None:
+def fit(config: RunConfig, stage: str, run_dir: str | Path, stream: PairStream) -> None:
     """Train one stage in ``run_dir/stage``, or go on where a killed run left it.
 
     The results are there: checkpoints, ``train.csv``, ``validation.csv`` and TensorBoard events.
@@ -116,14 +116,14 @@ def fit(settings: Settings, stage: str, run_dir: str | Path, source: Source) -> 
             where the last good state is.
     """
     folder = Path(run_dir) / stage
-    task = make_task(settings, stage, run_dir)
-    write_stage(folder, stage_record(settings, stage))
-    part = getattr(settings, stage)
+    task = make_task(config, stage, run_dir)
+    write_stage(folder, stage_record(config, stage))
+    part = getattr(config, stage)
     run_task(
         task,
-        source,
+        stream,
         folder,
-        settings.train,
+        config.train,
         epochs=part.epochs,
         batch_size=part.batch_size,
         learning_rate=part.learning_rate,
@@ -132,16 +132,16 @@ def fit(settings: Settings, stage: str, run_dir: str | Path, source: Source) -> 
 
 def run_task(
     task: Task,
-    source: Source,
+    stream: PairStream,
     folder: Path,
-    train: TrainSettings,
+    train: TrainConfig,
     *,
     epochs: float,
     batch_size: int,
     learning_rate: float,
 ) -> None:
     """`fit` for any task."""
-    epoch_steps = max(1, source.epoch_pairs // batch_size)
+    epoch_steps = max(1, stream.epoch_pairs // batch_size)
     total = max(1, round(epochs * epoch_steps))
     schedule = make_schedule(learning_rate, total, round(train.warmup_epochs * epoch_steps))
     optimizer = make_optimizer(
@@ -159,14 +159,14 @@ def run_task(
             return
         step = functools.partial(
             train_step,
-            draw=source.draw,
+            draw=stream.draw,
             loss=task.loss,
             optimizer=optimizer,
             batch_size=batch_size,
             ema_decay=train.ema_decay,
         )
         with RunLog(folder, start) as log:
-            loop = _Loop(task, source, train, checkpoints, log, schedule, batch_size, total)
+            loop = _Loop(task, stream, train, checkpoints, log, schedule, batch_size, total)
             loop.run(on_all_devices(state), start, jax.jit(step, donate_argnums=0))
 
 
@@ -175,8 +175,8 @@ class _Loop:
     """What stays the same from step to step of one stage."""
 
     task: Task
-    source: Source
-    train: TrainSettings
+    stream: PairStream
+    train: TrainConfig
     checkpoints: Checkpoints
     log: RunLog
     schedule: optax.Schedule
@@ -187,9 +187,9 @@ class _Loop:
         """Take steps ``start`` + 1 to ``total``; log, validate and save on the way."""
         train = self.train
         frozen, pairs, key = on_all_devices(
-            (self.task.frozen, self.source.validation, jax.random.key(train.seed))
+            (self.task.frozen, self.stream.validation, jax.random.key(train.seed))
         )
-        arrays = _on_all_devices(self.source.arrays(start))
+        arrays = _on_all_devices(self.stream.arrays(start))
         validate = jax.jit(self._mean_validation)
         window: list[dict[str, float]] = []
         waiting: list[StepMetrics] = []

@@ -6,26 +6,28 @@ import pytest
 
 from configs import cad, threedmatch
 from dbdnet_jax.classical.open3d import identity
+from dbdnet_jax.data import test_pairs
 from dbdnet_jax.evaluation import sweep
 from dbdnet_jax.evaluation.run import from_points
 from dbdnet_jax.evaluation.sweep import SWEEPS, render_sweep, save_sweep
 from dbdnet_jax.networks.params import Params
-from dbdnet_jax.training import test_pairs as pair_sets
-from dbdnet_jax.training.config import read_settings
+from dbdnet_jax.training.config import read_config
 
-NO_NETWORK = Params(None, None, read_settings(cad.get_config()).model)
+NO_NETWORK = Params(None, None, read_config(cad.get_config()).model)
 
 
 @pytest.fixture
-def settings(monkeypatch):
-    """The CAD settings, with one cheap method on few pairs."""
+def config(monkeypatch):
+    """The CAD config, with one cheap method on few pairs."""
     monkeypatch.setattr(sweep, "make_methods", lambda *_: {"still": from_points(identity)})
-    monkeypatch.setattr(pair_sets, "CAD_PAIRS", 4)
-    return read_settings(cad.get_config())
+    monkeypatch.setattr(test_pairs, "CAD_PAIRS", 4)
+    return read_config(cad.get_config())
 
 
-def test_a_method_is_scored_at_every_value_of_what_is_varied(settings, tmp_path):
-    points = list(sweep.sweep("rotation", settings, NO_NETWORK, tmp_path, count=3))
+def test_a_method_is_scored_at_every_value_of_what_is_varied(config, tmp_path):
+    points = list(
+        sweep.sweep("rotation", config.data, config.protocol, NO_NETWORK, tmp_path, seed=0, count=3)
+    )
     assert [point.value for point in points] == list(SWEEPS["rotation"].values)
     errors = [point.row.summary.error_rotation_deg for point in points]
     # A method that does not move errs by the rotation itself.
@@ -42,7 +44,7 @@ def test_a_method_is_scored_at_every_value_of_what_is_varied(settings, tmp_path)
 
 @pytest.mark.parametrize("name", SWEEPS)
 def test_every_value_is_a_protocol_of_its_own(name):
-    protocol = read_settings(cad.get_config()).protocol
+    protocol = read_config(cad.get_config()).protocol
     changed = [SWEEPS[name].change(protocol, value) for value in SWEEPS[name].values]
     assert len(set(changed)) == len(changed)
     assert protocol in changed  # the paper's own
@@ -50,4 +52,7 @@ def test_every_value_is_a_protocol_of_its_own(name):
 
 def test_scans_cannot_be_varied(tmp_path):
     with pytest.raises(ValueError, match="a sweep needs shapes.*threedmatch.*configs/cad.py"):
-        next(sweep.sweep("crop", read_settings(threedmatch.get_config()), NO_NETWORK, tmp_path, 1))
+        config = read_config(threedmatch.get_config())
+        next(
+            sweep.sweep("crop", config.data, config.protocol, NO_NETWORK, tmp_path, seed=0, count=1)
+        )

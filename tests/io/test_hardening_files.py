@@ -20,7 +20,7 @@ from dbdnet_jax.alignment.writing import write_ply
 from dbdnet_jax.io.point_files import read_points, read_transform
 from dbdnet_jax.io.safe_pickle import CheckpointError
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
-from dbdnet_jax.training.config import read_settings
+from dbdnet_jax.training.config import read_config
 from tests.aligning import pair, tiny_params
 from tests.torch_files import Touches
 
@@ -191,7 +191,7 @@ def test_a_bad_configuration_is_refused(name):
     config = ConfigDict(cad.get_config().to_dict())
     config[section][field] = value
     with pytest.raises(ValueError, match=message):
-        read_settings(config)
+        read_config(config)
 
 
 @pytest.mark.parametrize(

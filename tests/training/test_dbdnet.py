@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 
 from configs import cad
+from dbdnet_jax.data.training_pairs import PairStream, pairs_of_shapes
 from dbdnet_jax.io.safe_pickle import CheckpointError
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import save_params
 from dbdnet_jax.training.checkpoint import Checkpoints, load_best, write_stage
-from dbdnet_jax.training.config import Settings, read_settings, stage_record
+from dbdnet_jax.training.config import RunConfig, read_config, stage_record
 from dbdnet_jax.training.dbdnet import make_task
 from dbdnet_jax.training.loop import fit
 from dbdnet_jax.training.losses import JointTerms
-from dbdnet_jax.training.training_pairs import Source, shape_source
 from tests import stand_in
 from tests.conftest import EXACT, Tolerance, assert_close, assert_finite
 
 
-def settings() -> Settings:
+def config() -> RunConfig:
     """Six steps of two pairs for each stage."""
     config = cad.get_config()
     config.model.overlap_channels = config.model.registration_channels = 4
@@ -44,16 +44,16 @@ def settings() -> Settings:
     config.train.validation_pairs = 2
     config.overlap.epochs = config.registration.epochs = config.joint.epochs = 3.0
     config.registration.masks = "predicted"
-    return read_settings(config)
+    return read_config(config)
 
 
-SETTINGS = settings()
+CONFIG = config()
 
 
-def source() -> Source:
+def source() -> PairStream:
     """The same two pairs in every step, so that six steps show."""
     shapes = stand_in.shapes(count=4, points=64)
-    pairs = shape_source(shapes, shapes, SETTINGS.protocol, seed=0, validation_pairs=2)
+    pairs = pairs_of_shapes(shapes, shapes, CONFIG.protocol, seed=0, validation_pairs=2)
     return pairs._replace(
         draw=lambda key, number, arrays: pairs.draw(
             jax.random.fold_in(jax.random.key(1), number % 2), number % 2, arrays
@@ -71,7 +71,7 @@ def run_dir(tmp_path_factory):
     """A run of both stages."""
     folder = tmp_path_factory.mktemp("run")
     for stage in ("overlap", "registration"):
-        fit(SETTINGS, stage, folder, source())
+        fit(CONFIG, stage, folder, source())
     return folder
 
 
@@ -83,7 +83,7 @@ def test_some_steps_lower_the_loss(run_dir, stage):
 
 def test_the_second_stage_leaves_the_first_one_alone(run_dir):
     params = load_best(run_dir)
-    assert params.config == SETTINGS.model
+    assert params.config == CONFIG.model
     assert_finite((params.overlap, params.registration))
     with Checkpoints(run_dir / "overlap") as checkpoints:
         trained = checkpoints.restore_weights(checkpoints.best_step())
@@ -95,8 +95,8 @@ def test_a_stopped_second_stage_ends_as_an_unbroken_one(run_dir, tmp_path):
     pairs = source()
     stopping = pairs._replace(arrays=lambda start: itertools.islice(pairs.arrays(start), 3))
     with pytest.raises(StopIteration):
-        fit(SETTINGS, "registration", tmp_path, stopping)
-    fit(SETTINGS, "registration", tmp_path, pairs)
+        fit(CONFIG, "registration", tmp_path, stopping)
+    fit(CONFIG, "registration", tmp_path, pairs)
     found, expected = (load_best(folder).registration for folder in (tmp_path, run_dir))
     jax.tree.map(lambda a, b: assert_close(a, b, EXACT), found, expected)
     for name in ("registration/train.csv", "registration/validation.csv"):
@@ -107,16 +107,16 @@ def test_a_stopped_second_stage_ends_as_an_unbroken_one(run_dir, tmp_path):
 def test_networks_of_several_passes_go_on_from_weights(run_dir, tmp_path, stage):
     weights = tmp_path / "weights.npz"
     save_params(weights, load_best(run_dir))
-    settings = dataclasses.replace(
-        SETTINGS,
-        model=dataclasses.replace(SETTINGS.model, overlap_passes=2, iterations=2),
-        train=dataclasses.replace(SETTINGS.train, start=str(weights), learning_rate=1e-5),
-        overlap=dataclasses.replace(SETTINGS.overlap, learning_rate=1e-5),
+    config = dataclasses.replace(
+        CONFIG,
+        model=dataclasses.replace(CONFIG.model, overlap_passes=2, iterations=2),
+        train=dataclasses.replace(CONFIG.train, start=str(weights), learning_rate=1e-5),
+        overlap=dataclasses.replace(CONFIG.overlap, learning_rate=1e-5),
         registration=dataclasses.replace(
-            SETTINGS.registration, learning_rate=1e-5, masks="imperfect"
+            CONFIG.registration, learning_rate=1e-5, masks="imperfect"
         ),
     )
-    fit(settings, stage, tmp_path, source())
+    fit(config, stage, tmp_path, source())
     found, start = (getattr(load_best(folder), stage) for folder in (tmp_path, run_dir))
     jax.tree.map(lambda a, b: assert_close(a, b, Tolerance(rtol=0.0, atol=1e-3)), found, start)
     moved = jax.tree.leaves(jax.tree.map(lambda a, b: bool((a != b).any()), found, start))
@@ -124,21 +124,21 @@ def test_networks_of_several_passes_go_on_from_weights(run_dir, tmp_path, stage)
 
 
 def test_a_start_must_be_there(tmp_path):
-    train = dataclasses.replace(SETTINGS.train, start=str(tmp_path / "gone.npz"))
+    train = dataclasses.replace(CONFIG.train, start=str(tmp_path / "gone.npz"))
     with pytest.raises(FileNotFoundError, match="there is none at .*gone.npz. Give its path, or"):
-        fit(dataclasses.replace(SETTINGS, train=train), "overlap", tmp_path, source())
+        fit(dataclasses.replace(CONFIG, train=train), "overlap", tmp_path, source())
 
 
 def test_weights_of_another_width_are_no_start(run_dir, tmp_path):
     weights = tmp_path / "weights.npz"
     save_params(weights, load_best(run_dir))
-    settings = dataclasses.replace(
-        SETTINGS,
-        model=dataclasses.replace(SETTINGS.model, overlap_channels=8),
-        train=dataclasses.replace(SETTINGS.train, start=str(weights)),
+    config = dataclasses.replace(
+        CONFIG,
+        model=dataclasses.replace(CONFIG.model, overlap_channels=8),
+        train=dataclasses.replace(CONFIG.train, start=str(weights)),
     )
     with pytest.raises(CheckpointError, match="misshapen: overlap/.*config.train.start=''"):
-        fit(settings, "overlap", tmp_path, source())
+        fit(config, "overlap", tmp_path, source())
 
 
 def test_a_shape_with_nan_stops_the_overlap_stage(tmp_path):
@@ -146,29 +146,27 @@ def test_a_shape_with_nan_stops_the_overlap_stage(tmp_path):
     points = np.array(next(pairs.arrays(0)))
     points[:] = np.nan
     with pytest.raises(FloatingPointError, match="'source_focal' is nan in the step after step 0"):
-        fit(
-            SETTINGS, "overlap", tmp_path, pairs._replace(arrays=lambda _: itertools.repeat(points))
-        )
+        fit(CONFIG, "overlap", tmp_path, pairs._replace(arrays=lambda _: itertools.repeat(points)))
 
 
 def test_the_joint_stage_trains_both_networks_further(run_dir, tmp_path):
     weights = tmp_path / "weights.npz"
     save_params(weights, load_best(run_dir))
-    settings = dataclasses.replace(
-        SETTINGS,
-        model=dataclasses.replace(SETTINGS.model, overlap_passes=2),
+    config = dataclasses.replace(
+        CONFIG,
+        model=dataclasses.replace(CONFIG.model, overlap_passes=2),
         train=dataclasses.replace(
-            SETTINGS.train, start=str(weights), clip_norm=1.0, weight_decay=0.0
+            CONFIG.train, start=str(weights), clip_norm=1.0, weight_decay=0.0
         ),
     )
     pairs = source()
     stopping = pairs._replace(arrays=lambda start: itertools.islice(pairs.arrays(start), 3))
     with pytest.raises(StopIteration):
-        fit(settings, "joint", tmp_path / "run", stopping)
-    fit(settings, "joint", tmp_path / "run", pairs)
+        fit(config, "joint", tmp_path / "run", stopping)
+    fit(config, "joint", tmp_path / "run", pairs)
     start = load_best(run_dir)
     with Checkpoints(tmp_path / "run" / "joint") as checkpoints:
-        found = Params(**checkpoints.restore_weights(6), config=settings.model)
+        found = Params(**checkpoints.restore_weights(6), config=config.model)
     for before, after in ((start.overlap, found.overlap), (start.registration, found.registration)):
         moved = jax.tree.leaves(jax.tree.map(lambda a, b: bool((a != b).any()), before, after))
         assert np.mean(moved) > 0.9
@@ -185,13 +183,13 @@ def test_the_joint_stage_trains_both_networks_further(run_dir, tmp_path):
 def test_the_joint_stage_goes_on_from_the_run_and_then_is_what_the_run_holds(run_dir, tmp_path):
     for stage in ("overlap", "registration"):
         (tmp_path / stage).symlink_to(run_dir / stage)
-    task = make_task(SETTINGS, "joint", tmp_path)
+    task = make_task(CONFIG, "joint", tmp_path)
     trained = load_best(run_dir)
     further = jax.tree.map(lambda leaf: leaf + 1, task.trainable)
     with Checkpoints(tmp_path / "joint") as checkpoints:
         checkpoints.save(6, {"params": further}, error=1.0)
-    write_stage(tmp_path / "joint", stage_record(SETTINGS, "joint"))
-    again, held = make_task(SETTINGS, "joint", tmp_path), load_best(tmp_path)
+    write_stage(tmp_path / "joint", stage_record(CONFIG, "joint"))
+    again, held = make_task(CONFIG, "joint", tmp_path), load_best(tmp_path)
     for name in ("overlap", "registration"):
         for found in (task.trainable[name], again.trainable[name]):
             jax.tree.map(lambda a, b: assert_close(a, b, EXACT), found, getattr(trained, name))
@@ -199,7 +197,7 @@ def test_the_joint_stage_goes_on_from_the_run_and_then_is_what_the_run_holds(run
 
 
 def test_networks_that_do_not_take_turns_can_be_trained_jointly_too(run_dir):
-    task, key = make_task(SETTINGS, "joint", run_dir), jax.random.key(0)
+    task, key = make_task(CONFIG, "joint", run_dir), jax.random.key(0)
     pair = jax.tree.map(lambda leaf: leaf[0], source().validation)
     shape = jax.eval_shape(
         jax.grad(task.loss, has_aux=True), task.trainable, task.frozen, pair, key
@@ -217,24 +215,24 @@ def test_the_frozen_network_of_registration_is_never_the_joint_one(run_dir, tmp_
     )
     with Checkpoints(tmp_path / "joint") as checkpoints:
         checkpoints.save(6, {"params": other}, error=1.0)
-    write_stage(tmp_path / "joint", stage_record(SETTINGS, "joint"))
-    frozen = make_task(SETTINGS, "registration", tmp_path).frozen
+    write_stage(tmp_path / "joint", stage_record(CONFIG, "joint"))
+    frozen = make_task(CONFIG, "registration", tmp_path).frozen
     jax.tree.map(lambda a, b: assert_close(a, b, EXACT), frozen, params.overlap)
 
 
 def test_the_joint_stage_needs_both_networks(run_dir, tmp_path):
     weights = tmp_path / "weights.npz"
     save_params(weights, dataclasses.replace(load_best(run_dir), registration=None))
-    train = dataclasses.replace(SETTINGS.train, start=str(weights))
+    train = dataclasses.replace(CONFIG.train, start=str(weights))
     with pytest.raises(CheckpointError, match=r"weights\.npz does not hold both. Train them in"):
-        fit(dataclasses.replace(SETTINGS, train=train), "joint", tmp_path, source())
+        fit(dataclasses.replace(CONFIG, train=train), "joint", tmp_path, source())
     with pytest.raises(CheckpointError, match="two trained networks; .*--stage=both"):
-        fit(SETTINGS, "joint", tmp_path, source())
+        fit(CONFIG, "joint", tmp_path, source())
     (tmp_path / "overlap").symlink_to(run_dir / "overlap")
     with pytest.raises(CheckpointError, match="two trained networks; .*config.train.start=FILE"):
-        fit(SETTINGS, "joint", tmp_path, source())
+        fit(CONFIG, "joint", tmp_path, source())
 
 
 def test_registration_needs_the_overlap_network(tmp_path):
     with pytest.raises(CheckpointError, match="--stage=overlap or both"):
-        fit(SETTINGS, "registration", tmp_path, source())
+        fit(CONFIG, "registration", tmp_path, source())

@@ -12,7 +12,7 @@ import pytest
 from configs import modelnet
 from dbdnet_jax.networks.dbdnet.released import to_released
 from dbdnet_jax.networks.params import Params
-from dbdnet_jax.training.config import read_settings
+from dbdnet_jax.training.config import read_config
 from dbdnet_jax.training.dbdnet import make_task
 from dbdnet_jax.training.loop import init_state, train_step
 from dbdnet_jax.training.optimizer import make_optimizer
@@ -46,13 +46,13 @@ def trained(stage: str, numbers: tuple[int, ...]) -> Trained:
     params = released_params()
     # In evaluation mode, as there: no dropout.
     model = dataclasses.replace(params.config, dropout=0.0)
-    settings = read_settings(modelnet.get_config())
-    given = dataclasses.replace(settings.registration, masks="truth")
-    settings = dataclasses.replace(settings, model=model, registration=given)
-    task = make_task(settings, stage, "no folder is needed")
+    config = read_config(modelnet.get_config())
+    given = dataclasses.replace(config.registration, masks="truth")
+    config = dataclasses.replace(config, model=model, registration=given)
+    task = make_task(config, stage, "no folder is needed")
     optimizer = optax.chain(
         optax.trace(decay=0.0),  # keeps the gradient
-        make_optimizer(optax.constant_schedule(1e-3), weight_decay=settings.train.weight_decay),
+        make_optimizer(optax.constant_schedule(1e-3), weight_decay=config.train.weight_decay),
     )
     step = jax.jit(
         functools.partial(

@@ -15,7 +15,7 @@ from dbdnet_jax.networks.dbdnet.register import predict_overlap, register_given_
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.ops.sampling import farthest_order
 from dbdnet_jax.training import dbdnet as stages
-from dbdnet_jax.training.config import read_settings
+from dbdnet_jax.training.config import read_config
 from dbdnet_jax.types import Pair
 from tests import oracle
 from tests.conftest import assert_close, random_cloud
@@ -104,7 +104,7 @@ def test_farthest_point_sampling_has_no_hole_around_the_origin(x64):
 
 def test_the_frozen_overlap_network_gets_no_key_for_dropout(tmp_path, monkeypatch):
     model = dataclasses.replace(SMALL, dropout=RATE)
-    settings = dataclasses.replace(read_settings(modelnet.get_config()), model=model)
+    config = dataclasses.replace(read_config(modelnet.get_config()), model=model)
     (tmp_path / "overlap").mkdir()
     keys = {}
 
@@ -119,7 +119,7 @@ def test_the_frozen_overlap_network_gets_no_key_for_dropout(tmp_path, monkeypatc
     monkeypatch.setattr(stages, "predict_overlap_and_matches", predicted)
     monkeypatch.setattr(stages, "register_given_overlap", registered)
     monkeypatch.setattr(stages, "registration_loss", lambda *_: None)
-    task = stages.make_task(settings, "registration", tmp_path)
+    task = stages.make_task(config, "registration", tmp_path)
     task.loss(task.trainable, task.frozen, Pair(*CLOUDS, *[None] * 5), jax.random.key(0))
     assert keys["overlap"] is None and keys["registration"] is not None
 

@@ -17,19 +17,19 @@ from jaxtyping import Array, Int, PRNGKeyArray
 
 from dbdnet_jax.data.augment import make_varied_pair, require_enough_points
 from dbdnet_jax.data.cad import cad_split
+from dbdnet_jax.data.config import DataConfig
 from dbdnet_jax.data.modelnet40 import load_modelnet40
 from dbdnet_jax.data.pairs import Protocol, make_pair
 from dbdnet_jax.data.procedural.shapes import procedural_shapes
 from dbdnet_jax.data.shapes import Shapes, joined, select
 from dbdnet_jax.io.files import cache_folder
-from dbdnet_jax.training.config import DataSettings, Settings
 from dbdnet_jax.types import Pair
 
 VALIDATION_SEED = 71  # not the run's seed: errors of runs with other seeds compare
 HELD_OUT = 20  # every 20th training shape of a set that has no validation split
 
 
-class Source(NamedTuple):
+class PairStream(NamedTuple):
     """Pairs without end for training, and a fixed set for validation.
 
     ``arrays(start)`` yields what step ``start`` and those after it draw from;
@@ -42,32 +42,36 @@ class Source(NamedTuple):
     validation: Pair  # stacked: every field with a leading axis
 
 
-def load_source(settings: Settings, batch_size: int) -> Source:
-    """The source that ``config.data`` names.
+def load_training_pairs(
+    data: DataConfig, protocol: Protocol, *, seed: int, validation_pairs: int, batch_size: int
+) -> PairStream:
+    """The pairs that ``data`` names.
+
+    ``batch_size`` is that of the stage: scans are read from disk in batches.
 
     Raises:
         FileNotFoundError: its folder, or a file in it, is not there; says where to get it.
         ValueError: no folder given, a damaged file, or an unknown choice.
     """
-    if settings.data.name != "cad" and not settings.data.folder:
+    if data.name != "cad" and not data.folder:
         raise ValueError(
-            f"config.data.folder must be where {settings.data.name} stands; it is not set. Give "
+            f"config.data.folder must be where {data.name} stands; it is not set. Give "
             "--config.data.folder=PATH."
         )
-    if settings.data.name == "threedmatch":
-        return _scans(settings, batch_size)
-    train, validation = load_training_shapes(settings.data)
-    return shape_source(
+    if data.name == "threedmatch":
+        return _scans(data.folder, protocol, seed, validation_pairs, batch_size)
+    train, validation = load_training_shapes(data)
+    return pairs_of_shapes(
         train,
         validation,
-        settings.protocol,
-        seed=settings.train.seed,
-        validation_pairs=settings.train.validation_pairs,
-        varied=settings.data.varied,
+        protocol,
+        seed=seed,
+        validation_pairs=validation_pairs,
+        varied=data.varied,
     )
 
 
-def load_training_shapes(data: DataSettings) -> tuple[Shapes, Shapes]:
+def load_training_shapes(data: DataConfig) -> tuple[Shapes, Shapes]:
     """Training and validation shapes. No test shape is among them.
 
     ModelNet40 has no validation split of its own: every 20th training shape serves as one.
@@ -83,7 +87,7 @@ def load_training_shapes(data: DataSettings) -> tuple[Shapes, Shapes]:
     return select(shapes, ~held_out), select(shapes, held_out)
 
 
-def shape_source(
+def pairs_of_shapes(
     train: Shapes,
     validation: Shapes,
     protocol: Protocol,
@@ -91,7 +95,7 @@ def shape_source(
     seed: int,
     validation_pairs: int,
     varied: float = 0.0,
-) -> Source:
+) -> PairStream:
     """Pairs drawn on the device; every epoch sees every shape once, in an order of its own.
 
     Of the training pairs a share of ``varied`` is drawn by `make_varied_pair`.
@@ -122,7 +126,7 @@ def shape_source(
             lambda: make_pair(key, shape, normals, protocol),
         )
 
-    return Source(
+    return PairStream(
         epoch_pairs=count,
         arrays=lambda start: itertools.repeat(train.points),
         draw=draw,
@@ -145,27 +149,28 @@ def _fixed_pairs(shapes: Shapes, protocol: Protocol, count: int) -> Pair:
     return draw(np.arange(count), shapes.points[rows], shapes.normals[rows])
 
 
-def _scans(settings: Settings, batch_size: int) -> Source:
+def _scans(
+    folder: str, protocol: Protocol, seed: int, validation_pairs: int, batch_size: int
+) -> PairStream:
     """3DMatch's pairs, read ahead of the step that needs them."""
     from dbdnet_jax.data.threedmatch import batches, load_info, load_pair
 
-    folder, protocol = settings.data.folder, settings.protocol
     train, validation = load_info(folder, "train"), load_info(folder, "valid")
     options: dict[str, Any] = {
         "points": protocol.points,
         "radius_m": protocol.overlap_radius,
         "cache": cache_folder() / "threedmatch",
     }
-    count = min(settings.train.validation_pairs, len(validation))
+    count = min(validation_pairs, len(validation))
     rows = [i * len(validation) // count for i in range(count)]
     fixed = [load_pair(folder, validation, i, seed=VALIDATION_SEED, **options) for i in rows]
-    return Source(
+    return PairStream(
         epoch_pairs=len(train),
         arrays=lambda start: batches(
             folder,
             train,
             batch_size=batch_size,
-            seed=settings.train.seed,
+            seed=seed,
             start_step=start,
             **options,
         ),

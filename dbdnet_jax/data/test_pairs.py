@@ -9,13 +9,14 @@ import numpy as np
 from jaxtyping import Bool
 
 from dbdnet_jax.data.cad import HALVES, cad_split
+from dbdnet_jax.data.config import DataConfig
 from dbdnet_jax.data.frozen import CAD_VARIANTS, cad_test_pairs, freeze, thaw
 from dbdnet_jax.data.modelnet40 import load_modelnet40
+from dbdnet_jax.data.pairs import Protocol
 from dbdnet_jax.data.shapes import Shapes
 from dbdnet_jax.data.symmetry import symmetric_shapes
 from dbdnet_jax.data.threedmatch import load_correspondences, load_info, load_pair
 from dbdnet_jax.metrics.recall import Scans
-from dbdnet_jax.training.config import Settings
 from dbdnet_jax.types import Pair
 
 TEST_SEED = 2024  # not the run's: results of runs with other seeds compare
@@ -36,20 +37,21 @@ class PairSet(NamedTuple):
     symmetric: Bool[np.ndarray, " pairs"] | None = None
 
 
-def load_test_pairs(settings: Settings, run_dir: str | Path, benchmark: str = "3DMatch") -> PairSet:
-    """The test pairs that a configuration asks for: its data set, protocol and other half.
+def load_test_pairs(
+    data: DataConfig, protocol: Protocol, folder: str | Path, benchmark: str = "3DMatch"
+) -> PairSet:
+    """The test pairs of a data set under a protocol.
 
     A network trained on the seen half of the classes is tested on the unseen one, and the other
     way round. Where the package has no frozen set for the protocol, the pairs are drawn from
-    `TEST_SEED` and written to ``run_dir``. ``benchmark`` is "3DMatch" or "3DLoMatch", for scans.
+    `TEST_SEED` and written to ``folder``. ``benchmark`` is "3DMatch" or "3DLoMatch", for scans.
 
     Raises:
         FileNotFoundError: the data set's folder, or a file in it, is not there.
         ValueError: a damaged file.
     """
-    data, protocol = settings.data, settings.protocol
     if data.name == "threedmatch":
-        return _scans(settings, benchmark, Path(run_dir) / "overlap_labels")
+        return _scans(data.folder, protocol, benchmark, Path(folder) / "overlap_labels")
     half = None if data.categories == "all" else HALVES[1 - HALVES.index(data.categories)]
     name = f"{data.name}_test_{half or 'all'}"
     if data.name == "cad":
@@ -62,7 +64,7 @@ def load_test_pairs(settings: Settings, run_dir: str | Path, benchmark: str = "3
     else:
         shapes = load_modelnet40(data.folder, "test", half or "all")
         count = len(shapes)
-    path = Path(run_dir) / f"{name}.npz"
+    path = Path(folder) / f"{name}.npz"
     path.parent.mkdir(parents=True, exist_ok=True)
     freeze(path, shapes, protocol, seed=TEST_SEED, count=count)
     return PairSet(name, *thaw(path, shapes), symmetric=_symmetric(shapes, count))
@@ -73,9 +75,8 @@ def _symmetric(shapes: Shapes, count: int) -> Bool[np.ndarray, " count"]:
     return symmetric_shapes(shapes.points)[np.arange(count) % len(shapes)]
 
 
-def _scans(settings: Settings, benchmark: str, cache: Path) -> PairSet:
+def _scans(folder: str, protocol: Protocol, benchmark: str, cache: Path) -> PairSet:
     """All pairs of 3DMatch or 3DLoMatch; their fragments are read one after the other."""
-    folder, protocol = settings.data.folder, settings.protocol
     info = load_info(folder, benchmark)
     rows = range(len(info))
     pairs = [

@@ -12,8 +12,12 @@ from configs import threedmatch
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.modelnet40 import FILES, load_modelnet40
 from dbdnet_jax.data.threedmatch import load_info
-from dbdnet_jax.training.config import DataSettings, read_settings
-from dbdnet_jax.training.training_pairs import load_source, load_training_shapes, shape_source
+from dbdnet_jax.data.training_pairs import (
+    load_training_pairs,
+    load_training_shapes,
+    pairs_of_shapes,
+)
+from dbdnet_jax.training.config import DataConfig, read_config
 from tests import stand_in
 from tests.data.test_modelnet40 import write_file
 from tests.data.threedmatch_folder import write_folder
@@ -25,7 +29,7 @@ def test_every_epoch_sees_every_shape_once():
     still = dataclasses.replace(
         stand_in.PROTOCOL, noise_sigma=0.0, max_angle_deg=0.0, max_translation=0.0
     )
-    pairs = stand_in.shape_source(train, train, still, seed=1, validation_pairs=20)
+    pairs = stand_in.pairs_of_shapes(train, train, still, seed=1, validation_pairs=20)
     points, key = jnp.asarray(next(pairs.arrays(0))), jax.random.key(0)
     draw = jax.jit(lambda number: pairs.draw(key, number, points).target.points[0, 0])
     seen = [int(draw(number)) for number in range(24)]
@@ -36,14 +40,14 @@ def test_every_epoch_sees_every_shape_once():
 
 
 def test_cad_shapes_are_those_of_the_training_and_validation_splits():
-    train, validation = load_training_shapes(DataSettings("cad", "", "seen"))
+    train, validation = load_training_shapes(DataConfig("cad", "", "seen"))
     assert list(train.paths) == list(cad_split("train", "seen").paths)
     assert list(validation.paths) == list(cad_split("val", "seen").paths)
 
 
 def test_procedural_shapes_are_trained_on_beside_the_others():
-    train, _ = load_training_shapes(DataSettings("cad", "", "seen"))
-    more, _ = load_training_shapes(DataSettings("cad", "", "seen", procedural=3))
+    train, _ = load_training_shapes(DataConfig("cad", "", "seen"))
+    more, _ = load_training_shapes(DataConfig("cad", "", "seen", procedural=3))
     assert len(more) == len(train) + 3 and set(more.libraries[-3:]) == {"procedural"}
     np.testing.assert_array_equal(more.points[: len(train)], train.points)
 
@@ -54,7 +58,7 @@ def test_a_share_of_the_pairs_is_drawn_more_widely():
     key, points = jax.random.key(0), jnp.asarray(shapes.points)
 
     def radii(varied):
-        pairs = shape_source(shapes, shapes, clean, seed=0, validation_pairs=1, varied=varied)
+        pairs = pairs_of_shapes(shapes, shapes, clean, seed=0, validation_pairs=1, varied=varied)
         draw = jax.jit(lambda n: pairs.draw(jax.random.fold_in(key, n), n, points).target.points)
         on_shape = cKDTree(points.reshape(-1, 3)).query
         return np.array([on_shape(draw(jnp.asarray(n)))[0].max() for n in range(60)])
@@ -67,13 +71,13 @@ def test_a_share_of_the_pairs_is_drawn_more_widely():
 def test_shapes_too_small_to_draw_widely_are_refused_before_anything_starts():
     shapes = stand_in.shapes(count=2, points=20)
     with pytest.raises(ValueError, match="points need shapes of at least 24; got 20"):
-        shape_source(shapes, shapes, stand_in.PROTOCOL, seed=0, validation_pairs=1, varied=0.1)
+        pairs_of_shapes(shapes, shapes, stand_in.PROTOCOL, seed=0, validation_pairs=1, varied=0.1)
 
 
 def test_every_twentieth_modelnet_shape_is_held_out(tmp_path):
     for number, name in enumerate(FILES["train"]):
         write_file(tmp_path / name, range(9), number)
-    train, validation = load_training_shapes(DataSettings("modelnet40", str(tmp_path), "all"))
+    train, validation = load_training_shapes(DataConfig("modelnet40", str(tmp_path), "all"))
     names = list(load_modelnet40(tmp_path, "train").names)
     assert list(validation.names) == [names[19], names[39]]
     assert sorted([*train.names, *validation.names]) == sorted(names)
@@ -82,7 +86,7 @@ def test_every_twentieth_modelnet_shape_is_held_out(tmp_path):
 def test_no_shapes_are_refused():
     nothing, some = stand_in.shapes(0), stand_in.shapes(8)
     with pytest.raises(ValueError, match="at least one shape each; got 0 and 8"):
-        shape_source(nothing, some, stand_in.PROTOCOL, seed=0, validation_pairs=1)
+        pairs_of_shapes(nothing, some, stand_in.PROTOCOL, seed=0, validation_pairs=1)
 
 
 def test_scans_come_in_batches_and_go_on_where_they_were(tmp_path, monkeypatch):
@@ -93,7 +97,10 @@ def test_scans_come_in_batches_and_go_on_where_they_were(tmp_path, monkeypatch):
     config.data.folder = str(tmp_path)
     config.protocol.points = 128
     config.train.validation_pairs = 2
-    source = load_source(read_settings(config), batch_size=2)
+    read = read_config(config)
+    source = load_training_pairs(
+        read.data, read.protocol, seed=0, validation_pairs=read.train.validation_pairs, batch_size=2
+    )
     assert source.epoch_pairs == len(load_info(tmp_path, "train")) == 3
     assert source.validation.source.points.shape == (2, 128, 3)
     first = source.arrays(0)
