@@ -24,7 +24,7 @@ from dbdnet_jax.errors import MissingExtraError, require_drawing
 from dbdnet_jax.evaluation.run import evaluate
 from dbdnet_jax.evaluation.sweep import SWEEP_PAIRS, SWEEPS, render_sweep, save_sweep, sweep
 from dbdnet_jax.evaluation.tables import render, save
-from dbdnet_jax.io.files import write_whole
+from dbdnet_jax.io.files import write_atomic
 from dbdnet_jax.io.programs import keep_compiled_programs
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import PRETRAINED, load_named
@@ -110,7 +110,7 @@ def main(argv: list[str]) -> None:
     save(evaluation, run_dir)
     if REPORT.value:
         page = run_dir / f"evaluation_{evaluation.pair_set}.html"
-        write_whole(page, evaluation_page(evaluation, run_dir))
+        write_atomic(page, evaluation_page(evaluation, run_dir))
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from dbdnet_jax.io.files import write_whole
+from dbdnet_jax.io.files import write_atomic
 
 SIZE = 2048  # of the product that measures the machine
 LIBRARIES = ("jax", "jaxlib", "flax", "optax", "numpy")
@@ -99,7 +99,7 @@ def publish(found: dict[str, Any], out: str | None) -> None:
     text = json.dumps(found, indent=1)
     print(text)
     if out:
-        write_whole(Path(out), (text + "\n").encode())
+        write_atomic(Path(out), (text + "\n").encode())
 
 
 def processor() -> str:

@@ -214,18 +214,18 @@ def _draw(
     job: Job, alignment: "Alignment", source: "np.ndarray", target: "np.ndarray", command: str
 ) -> None:
     """Write the page and the picture that are asked for."""
-    from dbdnet_jax.io.files import write_whole
+    from dbdnet_jax.io.files import write_atomic
 
     names = str(job.source), str(job.target)
     if job.report is not None:
         from dbdnet_jax.drawing.alignment_page import alignment_page
 
         page = alignment_page(alignment, source, target, names=names, command=command)
-        write_whole(job.report, page)
+        write_atomic(job.report, page)
     if job.picture is not None:
         from dbdnet_jax.drawing.picture import alignment_picture
 
-        write_whole(job.picture, alignment_picture(alignment, source, target, names=names))
+        write_atomic(job.picture, alignment_picture(alignment, source, target, names=names))
 
 
 def summary(source: Path, target: Path, alignment: "Alignment") -> str:

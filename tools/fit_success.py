@@ -31,7 +31,7 @@ from dbdnet_jax.alignment.success import success_probability as probability_of
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.frozen import cad_test_pairs
 from dbdnet_jax.data.pairs import Protocol, make_pair
-from dbdnet_jax.io.files import write_whole
+from dbdnet_jax.io.files import write_atomic
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import load_named
 from dbdnet_jax.types import Pair
@@ -175,7 +175,7 @@ def main() -> None:
     about = {"pairs": len(success), "right": float(success.mean()), "five_folds": figures}
     text = json.dumps(fitted | {"about": about}, indent=2)
     options.output.parent.mkdir(exist_ok=True)
-    write_whole(options.output, (text + "\n").encode())
+    write_atomic(options.output, (text + "\n").encode())
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ import numpy as np
 from dbdnet_jax.alignment.writing import write_ply
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.pairs import Protocol, make_pair
-from dbdnet_jax.io.files import write_whole
+from dbdnet_jax.io.files import write_atomic
 
 FOLDER = Path(__file__).parents[1] / "examples"
 SHAPE = "corner sofa"
@@ -36,7 +36,7 @@ def main() -> None:
     write_ply(FOLDER / "scan_a.ply", RADIUS_M * pair.source.points)
     write_ply(FOLDER / "scan_b.ply", RADIUS_M * pair.target.points + FRAME_M)
     rows = "".join(" ".join(f"{x:.9g}" for x in row) + "\n" for row in motion)
-    write_whole(FOLDER / "b_from_a.txt", rows.encode())
+    write_atomic(FOLDER / "b_from_a.txt", rows.encode())
     print(f"{FOLDER}: {shapes.names[row]} by {shapes.creators[row]}, {shapes.licences[row]}")
 
 

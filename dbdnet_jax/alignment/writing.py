@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from dbdnet_jax.alignment.align import Alignment
-from dbdnet_jax.io.files import write_whole
+from dbdnet_jax.io.files import write_atomic
 
 TRANSFORM_ENDINGS = (".txt", ".json", ".npy")
 
@@ -45,14 +45,14 @@ def write_transform(path: Path, alignment: Alignment) -> None:
         np.save(buffer, alignment.transform)
     else:
         np.savetxt(buffer, alignment.transform, fmt="%.17g")
-    write_whole(path, buffer.getvalue())
+    write_atomic(path, buffer.getvalue())
 
 
 def write_ply(path: Path, points: Float[np.ndarray, "n 3"]) -> None:
     """Points as a binary PLY in float64."""
     axes = "".join(f"property double {axis}\n" for axis in "xyz")
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n{axes}end_header\n"
-    write_whole(path, head.encode() + np.ascontiguousarray(points, "<f8").tobytes())
+    write_atomic(path, head.encode() + np.ascontiguousarray(points, "<f8").tobytes())
 
 
 def as_json(alignment: Alignment) -> dict[str, Any]:

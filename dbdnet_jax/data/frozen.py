@@ -11,7 +11,7 @@ import numpy as np
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.pairs import Protocol, Recipe, assemble, draw_recipe
 from dbdnet_jax.data.shapes import Shapes
-from dbdnet_jax.io.files import write_whole
+from dbdnet_jax.io.files import write_atomic
 from dbdnet_jax.types import Pair, Rigid
 
 NOISE_UNIT = 2.0**-15  # of the stored integers: 3e-5 of a radius, far below any noise of interest
@@ -54,7 +54,7 @@ def freeze(path: str | Path, shapes: Shapes, protocol: Protocol, *, seed: int, c
         overlap_radius=np.float64(protocol.overlap_radius),
         points_sha256=np.str_(points_hash(shapes)),
     )
-    write_whole(Path(path), buffer.getvalue())
+    write_atomic(Path(path), buffer.getvalue())
     return hashlib.sha256(buffer.getvalue()).hexdigest()
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from dbdnet_jax.io.files import write_whole
+from dbdnet_jax.io.files import write_atomic
 
 
 def nearest_within(
@@ -56,5 +56,5 @@ def overlap_labels(
     file.parent.mkdir(parents=True, exist_ok=True)
     labels = io.BytesIO()
     np.savez_compressed(labels, source=np.packbits(near_source), target=np.packbits(near_target))
-    write_whole(file, labels.getbuffer())
+    write_atomic(file, labels.getbuffer())
     return near_source, near_target

@@ -13,7 +13,7 @@ from dbdnet_jax.data.config import DataConfig
 from dbdnet_jax.data.pairs import Protocol
 from dbdnet_jax.data.test_pairs import load_test_pairs
 from dbdnet_jax.evaluation.run import Row, evaluate_methods, make_methods, possible
-from dbdnet_jax.io.files import write_whole
+from dbdnet_jax.io.files import write_atomic
 from dbdnet_jax.networks.params import Params
 
 SWEEP_PAIRS = 60  # of each value, unless told otherwise
@@ -132,7 +132,7 @@ def save_sweep(name: str, points: list[SweepPoint], run_dir: str | Path, command
             )
     path = Path(run_dir) / f"sweep_{name}.csv"
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, text.getvalue().encode())
+    write_atomic(path, text.getvalue().encode())
     return path
 
 

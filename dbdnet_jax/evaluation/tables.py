@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from dbdnet_jax.evaluation.run import Evaluation, Row
-from dbdnet_jax.io.files import write_whole
+from dbdnet_jax.io.files import write_atomic
 from dbdnet_jax.metrics.pose import OverlapSummary, Summary
 from dbdnet_jax.metrics.recall import ScanRecall
 
@@ -204,7 +204,7 @@ def write_csv(path: str | Path, evaluation: Evaluation) -> None:
     writer = csv.DictWriter(text, [*lines[0], *provenance], lineterminator="\n")
     writer.writeheader()
     writer.writerows(line | provenance for line in lines)
-    write_whole(Path(path), text.getvalue().encode())
+    write_atomic(Path(path), text.getvalue().encode())
 
 
 def write_json(path: str | Path, evaluation: Evaluation) -> None:
@@ -212,7 +212,7 @@ def write_json(path: str | Path, evaluation: Evaluation) -> None:
     lines = [*(_flat(row) for row in evaluation.rows), _flat_constant(evaluation)]
     content = _provenance_fields(evaluation) | {"rows": lines}
     text = json.dumps(content, indent=1, allow_nan=False) + "\n"
-    write_whole(Path(path), text.encode())
+    write_atomic(Path(path), text.encode())
 
 
 def _of_columns(

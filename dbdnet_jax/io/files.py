@@ -10,7 +10,7 @@ def cache_folder() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dbdnet_jax"
 
 
-def write_whole(path: Path, data: bytes | bytearray | memoryview) -> None:
+def write_atomic(path: Path, data: bytes | bytearray | memoryview) -> None:
     """Write a file; an interrupted or failed write leaves what was there before.
 
     Raises:

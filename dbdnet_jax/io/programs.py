@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 from jax import export
 
-from dbdnet_jax.io.files import cache_folder, write_whole
+from dbdnet_jax.io.files import cache_folder, write_atomic
 
 TRACED = (
     "types.py",
@@ -52,7 +52,7 @@ def load_or_trace(function: Callable, name: str, *arguments) -> Callable:
     except OSError:
         exported = export.export(jax.jit(function))(*shapes)
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, exported.serialize())
+        write_atomic(path, exported.serialize())
     return jax.jit(exported.call)
 
 

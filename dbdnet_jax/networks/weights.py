@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from dbdnet_jax.io.files import write_whole
+from dbdnet_jax.io.files import write_atomic
 from dbdnet_jax.io.safe_pickle import CheckpointError
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.dbdnet.register import Params
@@ -68,7 +68,7 @@ def save_params(
     members: dict[str, Any] = {_HEADER: header, _CHECKSUM: _checksum(header, arrays), **arrays}
     buffer = io.BytesIO()
     np.savez(buffer, **members)
-    write_whole(path, buffer.getbuffer())
+    write_atomic(path, buffer.getbuffer())
 
 
 def load_params(path: str | Path) -> Params:

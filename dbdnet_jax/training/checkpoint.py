@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dbdnet_jax.io.files import write_whole
+from dbdnet_jax.io.files import write_atomic
 from dbdnet_jax.io.safe_pickle import CheckpointError
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.params import NETWORKS, Params
@@ -130,7 +130,7 @@ def write_stage(folder: Path, record: dict[str, Any]) -> None:
     record = json.loads(json.dumps(record))
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        write_whole(path, (json.dumps(record, indent=1) + "\n").encode())
+        write_atomic(path, (json.dumps(record, indent=1) + "\n").encode())
         return
     found = _flatten(read_stage(folder))
     wanted = _flatten(record)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from dbdnet_jax.io.files import write_whole
+from dbdnet_jax.io.files import write_atomic
 
 
 class RunLog:
@@ -46,6 +46,6 @@ def _truncate(path: Path, last: int) -> None:
     head, *rows = path.read_text().splitlines(keepends=True)
     kept = [row for row in rows if row.endswith("\n") and int(row.split(",")[0]) <= last]
     if kept:
-        write_whole(path, "".join([head, *kept]).encode())
+        write_atomic(path, "".join([head, *kept]).encode())
     else:
         path.unlink()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from dbdnet_jax.io.files import write_whole
+from dbdnet_jax.io.files import write_atomic
 from dbdnet_jax.io.point_files import MESH_SAMPLES, read_points, read_transform
 from tests.conftest import random_cloud
 
@@ -126,5 +126,5 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypat
     (tmp_path / "a").write_bytes(b"old")
     monkeypatch.setattr(f"os.{failing}", fail)
     with pytest.raises(OSError, match="No space"):
-        write_whole(tmp_path / "a", b"new")
+        write_atomic(tmp_path / "a", b"new")
     assert [(path.name, path.read_bytes()) for path in tmp_path.iterdir()] == [("a", b"old")]
