@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from dbdnet_jax.data.pairs import Protocol, Recipe, assemble
+from dbdnet_jax.data.pairs import PairDraw, Protocol, assemble
 from dbdnet_jax.ops import rigid
 from dbdnet_jax.ops.sampling import ball_crop, half_space_crop, random_direction
 from dbdnet_jax.types import Pair
@@ -59,8 +59,8 @@ def make_varied_pair(
     amount = jnp.maximum(chance[3] - CLEAN, 0) / (1 - CLEAN) * MOST_NOISE
     noise = protocol.noise_sigma * amount * jax.random.normal(noise_key, (2, protocol.size, 3))
     noise = jnp.clip(noise, -protocol.noise_clip, protocol.noise_clip)
-    recipe = Recipe(source, target, motion, noise[0], noise[1])
-    return assemble(recipe, points, normals, protocol.overlap_radius)
+    draw = PairDraw(source, target, motion, noise[0], noise[1])
+    return assemble(draw, points, normals, protocol.overlap_radius)
 
 
 def require_enough_points(total: int, protocol: Protocol) -> None:

@@ -1,4 +1,4 @@
-"""Test sets that are drawn once and then stay: files of recipes, named by their hash."""
+"""Test sets that are drawn once and then stay: files of draws, named by their hash."""
 
 import hashlib
 import io
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dbdnet_jax.data.cad import cad_split
-from dbdnet_jax.data.pairs import Protocol, Recipe, assemble, draw_recipe
+from dbdnet_jax.data.pairs import PairDraw, Protocol, assemble, draw_pair
 from dbdnet_jax.data.shapes import Shapes
 from dbdnet_jax.io.files import write_atomic
 from dbdnet_jax.types import Pair, Rigid
@@ -25,8 +25,10 @@ CAD_VARIANTS: dict[str, tuple[Protocol, str | None]] = {  # protocol, half of th
 }
 
 
-def freeze(path: str | Path, shapes: Shapes, protocol: Protocol, *, seed: int, count: int) -> str:
-    """Draw ``count`` recipes, shapes in turn, and write them to ``path``; returns the hash.
+def save_test_set(
+    path: str | Path, shapes: Shapes, protocol: Protocol, *, seed: int, count: int
+) -> str:
+    """Draw ``count`` pairs, shapes in turn, and write them to ``path``; returns the hash.
 
     Raises:
         ValueError: noise that the file's integers cannot hold.
@@ -38,19 +40,21 @@ def freeze(path: str | Path, shapes: Shapes, protocol: Protocol, *, seed: int, c
         )
     shape = np.arange(count) % len(shapes)
     keys = jax.random.split(jax.random.key(seed), count)
-    draw = jax.jit(lambda args: draw_recipe(args[0], args[1], protocol))
-    drawn = [draw((key, jnp.asarray(shapes.points[s]))) for key, s in zip(keys, shape, strict=True)]
-    recipes = jax.tree.map(lambda *leaves: np.stack(leaves), *drawn)
+    draw_one = jax.jit(lambda args: draw_pair(args[0], args[1], protocol))
+    drawn = [
+        draw_one((key, jnp.asarray(shapes.points[s]))) for key, s in zip(keys, shape, strict=True)
+    ]
+    draws = jax.tree.map(lambda *leaves: np.stack(leaves), *drawn)
     buffer = io.BytesIO()
     np.savez_compressed(
         buffer,
         shape=shape.astype(np.int32),
-        source_rows=recipes.source_rows.astype(np.int32),
-        target_rows=recipes.target_rows.astype(np.int32),
-        rotation=recipes.source_from_target.rotation,
-        translation=recipes.source_from_target.translation,
-        source_noise=np.rint(recipes.source_noise / NOISE_UNIT).astype(np.int16),
-        target_noise=np.rint(recipes.target_noise / NOISE_UNIT).astype(np.int16),
+        source_rows=draws.source_rows.astype(np.int32),
+        target_rows=draws.target_rows.astype(np.int32),
+        rotation=draws.source_from_target.rotation,
+        translation=draws.source_from_target.translation,
+        source_noise=np.rint(draws.source_noise / NOISE_UNIT).astype(np.int16),
+        target_noise=np.rint(draws.target_noise / NOISE_UNIT).astype(np.int16),
         overlap_radius=np.float64(protocol.overlap_radius),
         points_sha256=np.str_(points_hash(shapes)),
     )
@@ -58,7 +62,7 @@ def freeze(path: str | Path, shapes: Shapes, protocol: Protocol, *, seed: int, c
     return hashlib.sha256(buffer.getvalue()).hexdigest()
 
 
-def thaw(path: str | Path, shapes: Shapes) -> tuple[Pair, str]:
+def load_test_set(path: str | Path, shapes: Shapes) -> tuple[Pair, str]:
     """The pairs of a frozen set, as NumPy arrays with a leading axis, and the file's hash.
 
     Raises:
@@ -71,7 +75,7 @@ def thaw(path: str | Path, shapes: Shapes) -> tuple[Pair, str]:
         with np.load(io.BytesIO(data), allow_pickle=False) as stored:
             held = {name: stored[name] for name in stored.files}
         expected = str(held["points_sha256"])
-        recipes = Recipe(
+        draws = PairDraw(
             held["source_rows"],
             held["target_rows"],
             Rigid(held["rotation"], held["translation"]),
@@ -81,22 +85,22 @@ def thaw(path: str | Path, shapes: Shapes) -> tuple[Pair, str]:
         rows, radius = held["shape"], float(held["overlap_radius"])
     except Exception as error:  # zipfile, zlib and NumPy raise many kinds
         raise ValueError(
-            f"a frozen test set must be readable; {path} is not ({error}). Delete it and freeze "
+            f"a frozen test set must be readable; {path} is not ({error}). Delete it and draw "
             "it again, or reinstall dbdnet_jax if it is part of the package."
         ) from error
     if points_hash(shapes) != expected:
         raise ValueError(
             f"{path} was frozen on shapes with hash {expected[:12]}; these have "
-            f"{points_hash(shapes)[:12]}. Give the same data set and split, or freeze it anew."
+            f"{points_hash(shapes)[:12]}. Give the same data set and split, or draw it anew."
         )
 
     @jax.jit
-    def pair(recipe, points, normals):
-        return assemble(recipe, points, normals, radius)
+    def pair(draw, points, normals):
+        return assemble(draw, points, normals, radius)
 
     pairs = [
         jax.device_get(
-            pair(jax.tree.map(lambda leaf: leaf[i], recipes), shapes.points[s], shapes.normals[s])  # noqa: B023
+            pair(jax.tree.map(lambda leaf: leaf[i], draws), shapes.points[s], shapes.normals[s])  # noqa: B023
         )
         for i, s in enumerate(rows)
     ]
@@ -123,4 +127,4 @@ def cad_test_pairs(variant: str) -> tuple[Pair, str]:
             f"variant must be one of {tuple(CAD_VARIANTS)}; got {variant!r}. Choose one of these."
         )
     _, half = CAD_VARIANTS[variant]
-    return thaw(CAD_FOLDER / f"cad_test_{variant}.npz", cad_split("test", half))
+    return load_test_set(CAD_FOLDER / f"cad_test_{variant}.npz", cad_split("test", half))

@@ -1,7 +1,7 @@
 """The paper's protocol: how one shape becomes a pair of partial, moved and noisy clouds.
 
-A pair is drawn in two steps: a `Recipe` holds every random choice, and `assemble` follows it. A
-frozen test set is a file of recipes, so it is small, and the same on every machine.
+A pair is drawn in two steps: a `PairDraw` holds every random choice, and `assemble` follows it. A
+frozen test set is a file of draws, so it is small, and the same on every machine.
 """
 
 import dataclasses
@@ -54,7 +54,7 @@ class Protocol:
         return round(self.points * self.keep)
 
 
-class Recipe(NamedTuple):
+class PairDraw(NamedTuple):
     """Every random choice of one pair: rows of the shape, the source's motion, the noise."""
 
     source_rows: Int[Array, " n"]
@@ -71,10 +71,10 @@ def make_pair(
     protocol: Protocol,
 ) -> Pair:
     """One pair of a shape under the protocol: a pure function of the key."""
-    return assemble(draw_recipe(key, points, protocol), points, normals, protocol.overlap_radius)
+    return assemble(draw_pair(key, points, protocol), points, normals, protocol.overlap_radius)
 
 
-def draw_recipe(key: PRNGKeyArray, points: Float[Array, "s 3"], protocol: Protocol) -> Recipe:
+def draw_pair(key: PRNGKeyArray, points: Float[Array, "s 3"], protocol: Protocol) -> PairDraw:
     """Choose the points, the crops, the motion and the noise of one pair.
 
     Both clouds are drawn from the shape independently (`disjoint`: from two halves of it), and
@@ -104,26 +104,26 @@ def draw_recipe(key: PRNGKeyArray, points: Float[Array, "s 3"], protocol: Protoc
     )
     noise = protocol.noise_sigma * jax.random.normal(noise_key, (2, protocol.size, 3))
     noise = jnp.clip(noise, -protocol.noise_clip, protocol.noise_clip)
-    return Recipe(cropped[0], cropped[1], motion, noise[0], noise[1])
+    return PairDraw(cropped[0], cropped[1], motion, noise[0], noise[1])
 
 
 def assemble(
-    recipe: Recipe,
+    draw: PairDraw,
     points: Float[Array, "s 3"],
     normals: Float[Array, "s 3"],
     overlap_radius: float,
 ) -> Pair:
-    """Follow a recipe on a shape's points (s, 3) and unit normals (s, 3).
+    """Follow a pair draw on a shape's points (s, 3) and unit normals (s, 3).
 
     The source is the moved cloud, so the true pose is the inverse of the drawn motion.
     """
-    moved = rigid.apply(recipe.source_from_target, points[recipe.source_rows])
+    moved = rigid.apply(draw.source_from_target, points[draw.source_rows])
     turned = rigid.apply(
-        Rigid(recipe.source_from_target.rotation, jnp.zeros(3)), normals[recipe.source_rows]
+        Rigid(draw.source_from_target.rotation, jnp.zeros(3)), normals[draw.source_rows]
     )
-    source = moved + recipe.source_noise
-    target = points[recipe.target_rows] + recipe.target_noise
-    target_from_source = rigid.invert(recipe.source_from_target)
+    source = moved + draw.source_noise
+    target = points[draw.target_rows] + draw.target_noise
+    target_from_source = rigid.invert(draw.source_from_target)
     overlap = _overlap_labels(rigid.apply(target_from_source, source), target, overlap_radius)
     size = jnp.asarray(source.shape[0])
     return Pair(
@@ -133,7 +133,7 @@ def assemble(
         source_overlap=overlap[0],
         target_overlap=overlap[1],
         source_normals=turned,
-        target_normals=normals[recipe.target_rows],
+        target_normals=normals[draw.target_rows],
     )
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool
 
 from dbdnet_jax.data.cad import HALVES, cad_split
 from dbdnet_jax.data.config import DataConfig
-from dbdnet_jax.data.frozen import CAD_VARIANTS, cad_test_pairs, freeze, thaw
+from dbdnet_jax.data.frozen import CAD_VARIANTS, cad_test_pairs, load_test_set, save_test_set
 from dbdnet_jax.data.modelnet40 import load_modelnet40
 from dbdnet_jax.data.pairs import Protocol
 from dbdnet_jax.data.shapes import Shapes
@@ -66,8 +66,8 @@ def load_test_pairs(
         count = len(shapes)
     path = Path(folder) / f"{name}.npz"
     path.parent.mkdir(parents=True, exist_ok=True)
-    freeze(path, shapes, protocol, seed=TEST_SEED, count=count)
-    return PairSet(name, *thaw(path, shapes), symmetric=_symmetric(shapes, count))
+    save_test_set(path, shapes, protocol, seed=TEST_SEED, count=count)
+    return PairSet(name, *load_test_set(path, shapes), symmetric=_symmetric(shapes, count))
 
 
 def _symmetric(shapes: Shapes, count: int) -> Bool[np.ndarray, " count"]:

@@ -8,10 +8,10 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from dbdnet_jax.data.cad import cad_split
-from dbdnet_jax.data.frozen import CAD_VARIANTS, cad_test_pairs, freeze, thaw
+from dbdnet_jax.data.frozen import CAD_VARIANTS, cad_test_pairs, load_test_set, save_test_set
 from dbdnet_jax.data.pairs import (
     Protocol,
-    draw_recipe,
+    draw_pair,
     imperfect_overlap,
     make_pair,
     moved_pair,
@@ -69,30 +69,30 @@ def test_a_pair_has_the_protocols_size_motion_and_labels(pairs, shapes):
 
 def test_noise_has_its_sigma_and_normals_turn_with_the_cloud(shapes):
     points, normals = jnp.asarray(shapes.points[0]), jnp.asarray(shapes.normals[0])
-    recipe = draw_recipe(jax.random.key(0), points, Protocol())
-    noise = np.concatenate([recipe.source_noise, recipe.target_noise])
+    draw = draw_pair(jax.random.key(0), points, Protocol())
+    noise = np.concatenate([draw.source_noise, draw.target_noise])
     assert noise.std() == pytest.approx(0.01, rel=0.05) and np.abs(noise).max() <= 0.05
     pair = make_pair(jax.random.key(0), points, normals, Protocol())
     back = pair.source_normals @ pair.target_from_source.rotation.T
-    np.testing.assert_allclose(back, normals[recipe.source_rows], atol=1e-5)
+    np.testing.assert_allclose(back, normals[draw.source_rows], atol=1e-5)
 
 
 def test_each_crop_is_a_half_space_of_its_own(shapes):
     points = jnp.asarray(shapes.points[0])
     clean = Protocol(keep=0.5, noise_sigma=0.0)
-    recipe = draw_recipe(jax.random.key(1), points, clean)
-    for rows in (recipe.source_rows, recipe.target_rows):
+    draw = draw_pair(jax.random.key(1), points, clean)
+    for rows in (draw.source_rows, draw.target_rows):
         assert len(set(np.asarray(rows).tolist())) == 512
-    kept = [set(np.asarray(rows).tolist()) for rows in (recipe.source_rows, recipe.target_rows)]
+    kept = [set(np.asarray(rows).tolist()) for rows in (draw.source_rows, draw.target_rows)]
     assert len(kept[0] & kept[1]) < 256  # two draws and two planes
 
 
 def test_disjoint_clouds_share_no_point_and_want_enough_of_them(shapes):
     points = jnp.asarray(shapes.points[0])
-    recipe = draw_recipe(jax.random.key(2), points, Protocol(disjoint=True))
-    assert not set(np.asarray(recipe.source_rows)) & set(np.asarray(recipe.target_rows))
+    draw = draw_pair(jax.random.key(2), points, Protocol(disjoint=True))
+    assert not set(np.asarray(draw.source_rows)) & set(np.asarray(draw.target_rows))
     with pytest.raises(ValueError, match="shapes of at least 4000; got 2048. Lower points"):
-        draw_recipe(jax.random.key(2), points, Protocol(points=2000, disjoint=True))
+        draw_pair(jax.random.key(2), points, Protocol(points=2000, disjoint=True))
 
 
 def test_a_pair_is_decided_by_its_key(shapes):
@@ -121,10 +121,10 @@ def test_a_protocol_that_cannot_be_drawn_is_refused(fields, message):
 
 
 def test_a_frozen_set_thaws_to_what_was_drawn(tmp_path, shapes):
-    digest = freeze(tmp_path / "set.npz", shapes, SMALL, seed=4, count=5)
-    pairs, found = thaw(tmp_path / "set.npz", shapes)
+    digest = save_test_set(tmp_path / "set.npz", shapes, SMALL, seed=4, count=5)
+    pairs, found = load_test_set(tmp_path / "set.npz", shapes)
     assert found == digest and pairs.source.points.shape == (5, 45, 3)
-    assert freeze(tmp_path / "again.npz", shapes, SMALL, seed=4, count=5) == digest
+    assert save_test_set(tmp_path / "again.npz", shapes, SMALL, seed=4, count=5) == digest
     key = jax.random.split(jax.random.key(4), 5)[4]
     drawn = make_pair(key, jnp.asarray(shapes.points[1]), jnp.asarray(shapes.normals[1]), SMALL)
     # The noise is stored in steps of 3e-5.
@@ -134,12 +134,12 @@ def test_a_frozen_set_thaws_to_what_was_drawn(tmp_path, shapes):
 
 def test_a_frozen_set_refuses_other_shapes_and_damage(tmp_path, shapes):
     path = tmp_path / "set.npz"
-    freeze(path, shapes, SMALL, seed=4, count=2)
+    save_test_set(path, shapes, SMALL, seed=4, count=2)
     with pytest.raises(ValueError, match="was frozen on shapes with hash .* Give the same data"):
-        thaw(path, select(shapes, np.arange(2)))
+        load_test_set(path, select(shapes, np.arange(2)))
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(ValueError, match="must be readable; .*set.npz is not"):
-        thaw(path, shapes)
+        load_test_set(path, shapes)
 
 
 @pytest.mark.parametrize("variant", CAD_VARIANTS)

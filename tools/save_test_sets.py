@@ -1,10 +1,10 @@
 """Draw the frozen test sets of the embedded CAD shapes; done once, the files are committed.
 
-python tools/freeze_cad.py
+python tools/save_test_sets.py
 """
 
 from dbdnet_jax.data.cad import cad_split
-from dbdnet_jax.data.frozen import CAD_FOLDER, CAD_VARIANTS, freeze
+from dbdnet_jax.data.frozen import CAD_FOLDER, CAD_VARIANTS, save_test_set
 from dbdnet_jax.data.test_pairs import TEST_SEED
 
 PAIRS = 200
@@ -15,7 +15,7 @@ def main() -> None:
     CAD_FOLDER.mkdir(exist_ok=True)
     for variant, (protocol, half) in CAD_VARIANTS.items():
         path = CAD_FOLDER / f"cad_test_{variant}.npz"
-        digest = freeze(path, cad_split("test", half), protocol, seed=TEST_SEED, count=PAIRS)
+        digest = save_test_set(path, cad_split("test", half), protocol, seed=TEST_SEED, count=PAIRS)
         print(f"{path.name}  sha256 {digest}")
 
 
