@@ -48,7 +48,7 @@ def get_config() -> ConfigDict:
     config.overlap.epochs = 50.0
     config.overlap.gamma = 0.0
     config.registration.epochs = 50.0
-    config.registration.masks = "imperfect"
+    config.registration.masks = "perturbed"
     config.joint.epochs = 8.0
     config.joint.learning_rate = 3e-4  # both are near the end of what they can learn apart
     return config

@@ -137,7 +137,7 @@ def assemble(
     )
 
 
-def imperfect_motion(
+def perturbed_pose(
     key: PRNGKeyArray, pair: Pair, max_angle_deg: float, shift_sigma: float
 ) -> Rigid:
     """The true motion, then a turn about the source's centroid and a shift.
@@ -154,13 +154,13 @@ def imperfect_motion(
     return rigid.compose(Rigid(turn, shift), pair.target_from_source)
 
 
-def starting_motion(key: PRNGKeyArray, pair: Pair) -> Rigid:
+def initial_pose(key: PRNGKeyArray, pair: Pair) -> Rigid:
     """What a pass of a network may start from: nothing but aligned centroids, or the pose roughly.
 
     Two in five pairs start from the centroids, the others up to 40 degrees and 0.2 off.
     """
     choice_key, motion_key = jax.random.split(key)
-    roughly = imperfect_motion(motion_key, pair, max_angle_deg=40.0, shift_sigma=0.2)
+    roughly = perturbed_pose(motion_key, pair, max_angle_deg=40.0, shift_sigma=0.2)
     shift = jnp.mean(pair.target.points, axis=0) - jnp.mean(pair.source.points, axis=0)
     blind = jax.random.uniform(choice_key) < 0.4
     return jax.tree.map(
@@ -168,7 +168,7 @@ def starting_motion(key: PRNGKeyArray, pair: Pair) -> Rigid:
     )
 
 
-def imperfect_overlap(
+def perturbed_overlap(
     key: PRNGKeyArray, pair: Pair, overlap_radius: float
 ) -> tuple[Bool[Array, " n"], Bool[Array, " m"]]:
     """Overlap labels as wrong as a network's may be, more in one pair than in another.
@@ -178,7 +178,7 @@ def imperfect_overlap(
     """
     choice_key, motion_key = jax.random.split(key)
     choice = jax.random.uniform(choice_key)
-    motion = imperfect_motion(motion_key, pair, max_angle_deg=30.0, shift_sigma=0.1)
+    motion = perturbed_pose(motion_key, pair, max_angle_deg=30.0, shift_sigma=0.1)
     aligned = rigid.apply(motion, pair.source.points)
     labels = _overlap_labels(aligned, pair.target.points, overlap_radius)
     truth = pair.source_overlap, pair.target_overlap
@@ -189,7 +189,7 @@ def imperfect_overlap(
     return source, target
 
 
-def moved_pair(pair: Pair, motion: Rigid) -> Pair:
+def transform_source(pair: Pair, motion: Rigid) -> Pair:
     """The same pair with the source moved already."""
     source = pair.source._replace(points=rigid.apply(motion, pair.source.points))
     rest = rigid.compose(pair.target_from_source, rigid.invert(motion))

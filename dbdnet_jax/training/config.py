@@ -16,7 +16,7 @@ from dbdnet_jax.data.pairs import Protocol
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.training.losses import LossWeights
 
-MASKS = ("predicted", "truth", "imperfect")
+MASKS = ("predicted", "truth", "perturbed")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +73,7 @@ class RegistrationConfig:
     """Stage 2: the registration network behind the frozen overlap network.
 
     ``masks`` says which points it is given: those that the overlap network "predicted"; those
-    that overlap in "truth"; or "imperfect" ones (`pairs.imperfect_overlap`), with the true ones
+    that overlap in "truth"; or "perturbed" ones (`pairs.perturbed_overlap`), with the true ones
     for validation. The last two need no stage 1.
     """
 

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from dbdnet_jax.data.pairs import imperfect_overlap, moved_pair, starting_motion
+from dbdnet_jax.data.pairs import initial_pose, perturbed_overlap, transform_source
 from dbdnet_jax.io.safe_pickle import CheckpointError
 from dbdnet_jax.metrics.pose import pair_confusion, registration_errors
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
@@ -153,7 +153,7 @@ def _overlap_functions(config: RunConfig) -> tuple[LossFunction, Validation]:
         start_key, dropout_key = jax.random.split(key)
         dropout_key = dropout_key if model.dropout else None
         # Each pass is trained for itself, from starts such as the passes before it may leave.
-        start = starting_motion(start_key, pair) if model.overlap_passes > 1 else None
+        start = initial_pose(start_key, pair) if model.overlap_passes > 1 else None
         *predicted, matched = predict_overlap_and_matches(
             params, pair.source, pair.target, dropout_key, start
         )
@@ -185,8 +185,8 @@ def _registration_functions(config: RunConfig) -> tuple[LossFunction, Validation
         if stage.masks == "predicted":
             params = Params(frozen, None, model)
             return predict_overlap_and_matches(params, pair.source, pair.target, start=start)[:2]
-        if stage.masks == "imperfect":
-            return imperfect_overlap(key, pair, config.protocol.overlap_radius)
+        if stage.masks == "perturbed":
+            return perturbed_overlap(key, pair, config.protocol.overlap_radius)
         return pair.source_overlap, pair.target_overlap
 
     def answer(trainable, pair, masks, key=None, model=model):
@@ -196,11 +196,11 @@ def _registration_functions(config: RunConfig) -> tuple[LossFunction, Validation
 
     def loss(trainable, frozen, pair, key):
         mask_key, start_key, dropout_key = jax.random.split(key, 3)
-        start = starting_motion(start_key, pair) if _from_anywhere(model) else None
+        start = initial_pose(start_key, pair) if _from_anywhere(model) else None
         masks = given(mask_key, frozen, pair, start)
         one = model
         if start is not None:
-            pair = moved_pair(pair, start)
+            pair = transform_source(pair, start)
             one = dataclasses.replace(model, iterations=1)
         dropout_key = dropout_key if model.dropout else None
         found = answer(trainable, pair, masks, dropout_key, one)
@@ -233,7 +233,7 @@ def _joint_functions(config: RunConfig) -> tuple[LossFunction, Validation]:
         *overlap, matched = predict_overlap_and_matches(
             params, pair.source, pair.target, dropout_key, start
         )
-        moved = pair if start is None else moved_pair(pair, start)
+        moved = pair if start is None else transform_source(pair, start)
         found = register_given_overlap(params, moved.source, moved.target, *overlap, dropout_key)
         return overlap, matched, found, moved
 
@@ -250,7 +250,7 @@ def _joint_functions(config: RunConfig) -> tuple[LossFunction, Validation]:
                 jax.random.uniform(choice_key) < 0.5,
                 lambda motion: own_start(jax.lax.stop_gradient(trainable), pair, motion),
                 lambda motion: motion,
-                starting_motion(start_key, pair),
+                initial_pose(start_key, pair),
             )
         dropout_key = dropout_key if model.dropout else None
         overlap, matched, found, moved = turn(trainable, pair, start, dropout_key)

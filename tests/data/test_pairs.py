@@ -12,10 +12,10 @@ from dbdnet_jax.data.frozen import CAD_VARIANTS, cad_test_pairs, load_test_set, 
 from dbdnet_jax.data.pairs import (
     Protocol,
     draw_pair,
-    imperfect_overlap,
+    initial_pose,
     make_pair,
-    moved_pair,
-    starting_motion,
+    perturbed_overlap,
+    transform_source,
 )
 from dbdnet_jax.data.shapes import select
 from dbdnet_jax.ops import rigid
@@ -157,7 +157,7 @@ def test_an_unknown_test_set_is_refused():
 def test_imperfect_overlap_is_now_true_now_everything_now_something_between(pairs):
     pair = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), pairs)
     keys = jax.random.split(jax.random.key(9), 300)
-    draw = jax.jit(jax.vmap(lambda key: imperfect_overlap(key, pair, 0.1)))
+    draw = jax.jit(jax.vmap(lambda key: perturbed_overlap(key, pair, 0.1)))
     for masks, truth in zip(draw(keys), (pair.source_overlap, pair.target_overlap), strict=True):
         masks, truth = np.asarray(masks), np.asarray(truth)
         true, everything = (masks == truth).all(1), masks.all(1)
@@ -170,7 +170,7 @@ def test_imperfect_overlap_is_now_true_now_everything_now_something_between(pair
 def test_a_pass_starts_from_aligned_centroids_or_from_a_rough_pose(pairs):
     pair = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), pairs)
     keys = jax.random.split(jax.random.key(10), 300)
-    found = jax.jit(jax.vmap(lambda key: starting_motion(key, pair)))(keys)
+    found = jax.jit(jax.vmap(lambda key: initial_pose(key, pair)))(keys)
     rotation, translation = map(np.asarray, found)
     blind = np.all(rotation == np.eye(3), axis=(1, 2))
     assert 0.3 < blind.mean() < 0.5
@@ -184,8 +184,8 @@ def test_a_pass_starts_from_aligned_centroids_or_from_a_rough_pose(pairs):
 
 def test_a_moved_pair_has_the_rest_of_the_motion_left(pairs):
     pair = jax.tree.map(lambda leaf: jnp.asarray(leaf[1]), pairs)
-    motion = starting_motion(jax.random.key(3), pair)
-    moved = moved_pair(pair, motion)
+    motion = initial_pose(jax.random.key(3), pair)
+    moved = transform_source(pair, motion)
     aligned, again = (rigid.apply(p.target_from_source, p.source.points) for p in (pair, moved))
     assert_close(again, aligned, FLOAT32)
     assert not np.allclose(moved.source.points, pair.source.points, atol=0.1)

@@ -113,7 +113,7 @@ def test_networks_of_several_passes_go_on_from_weights(run_dir, tmp_path, stage)
         train=dataclasses.replace(CONFIG.train, start=str(weights), learning_rate=1e-5),
         overlap=dataclasses.replace(CONFIG.overlap, learning_rate=1e-5),
         registration=dataclasses.replace(
-            CONFIG.registration, learning_rate=1e-5, masks="imperfect"
+            CONFIG.registration, learning_rate=1e-5, masks="perturbed"
         ),
     )
     fit(config, stage, tmp_path, source())
