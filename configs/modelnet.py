@@ -19,7 +19,7 @@ def get_config() -> ConfigDict:
     config = ConfigDict()
     config.model = _model()
     config.data = ConfigDict(
-        {"name": "modelnet40", "folder": "", "categories": "all", "procedural": 0, "varied": 0.0}
+        {"name": "modelnet40", "folder": "", "categories": "all", "procedural": 0, "augment": 0.0}
     )
     config.protocol = ConfigDict(
         {

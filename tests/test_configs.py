@@ -126,8 +126,11 @@ def test_a_stage_may_resume_only_with_what_decides_its_outcome():
         ({"train__validation_pairs": 0}, r"validation_pairs must be at least 1; got 0"),
         ({"overlap__epochs": 0.0}, r"config\.overlap must have epochs > 0"),
         ({"joint__batch_size": 0}, r"config\.joint must have .*; got epochs=8.0, batch_size=0"),
-        ({"data__varied": 1.5}, r"config\.data\.varied must be in \[0, 1\].*; got 1\.5 for 'cad'"),
-        ({"data__varied": 0.5, "data__name": "threedmatch"}, r"0 for 'threedmatch'.*got 0\.5"),
+        (
+            {"data__augment": 1.5},
+            r"config\.data\.augment must be in \[0, 1\].*; got 1\.5 for 'cad'",
+        ),
+        ({"data__augment": 0.5, "data__name": "threedmatch"}, r"0 for 'threedmatch'.*got 0\.5"),
         ({"model__overlap_channels": 6}, r"multiple of 4"),
     ],
 )

@@ -17,7 +17,7 @@ CLEAN = 0.25  # of the pairs
 LARGEST_SCALE = 1.2  # and its inverse the smallest
 
 
-def make_varied_pair(
+def make_augmented_pair(
     key: PRNGKeyArray, points: Float[Array, "s 3"], normals: Float[Array, "s 3"], protocol: Protocol
 ) -> Pair:
     """One pair of a shape, as large as the protocol's clouds, everything else drawn more widely.
@@ -67,6 +67,7 @@ def require_enough_points(total: int, protocol: Protocol) -> None:
     """Raise ValueError where shapes of so many points are too small for disjoint clouds."""
     if 2 * protocol.size > total:
         raise ValueError(
-            f"varied pairs of {protocol.size} points need shapes of at least {2 * protocol.size}; "
-            f"got {total}. Lower config.protocol.points, or set config.data.varied=0."
+            f"augmented pairs of {protocol.size} points need shapes of at least "
+            f"{2 * protocol.size}; got {total}. Lower config.protocol.points, or set "
+            "config.data.augment=0."
         )

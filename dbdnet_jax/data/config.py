@@ -13,7 +13,7 @@ class DataConfig:
     folder: str
     categories: str  # "all", or one half of the shape classes: "seen" or "unseen"
     procedural: int = 0  # generated shapes to train on beside those of "cad": 15 ms each
-    varied: float = 0.0  # share of the training pairs under other conditions than the protocol's
+    augment: float = 0.0  # share of the training pairs under other conditions than the protocol's
 
     def __post_init__(self):
         """Refuse an unknown data set."""
@@ -26,8 +26,8 @@ class DataConfig:
                 "config.data.procedural must not be negative, and 0 for other data than 'cad'; got "
                 f"{self.procedural} for {self.name!r}. Use 0."
             )
-        if not 0 <= self.varied <= 1 or (self.varied and self.name == "threedmatch"):
+        if not 0 <= self.augment <= 1 or (self.augment and self.name == "threedmatch"):
             raise ValueError(
-                "config.data.varied must be in [0, 1], and 0 for 'threedmatch', whose pairs are "
-                f"read; got {self.varied} for {self.name!r}. Use 0."
+                "config.data.augment must be in [0, 1], and 0 for 'threedmatch', whose pairs are "
+                f"read; got {self.augment} for {self.name!r}. Use 0."
             )

@@ -174,7 +174,7 @@ def perturbed_overlap(
     """Overlap labels as wrong as a network's may be, more in one pair than in another.
 
     A fifth are the true ones and a fifth say that every point overlaps. The others are the labels
-    under an imperfect motion: in parts too many points, in parts too few.
+    under an perturbed pose: in parts too many points, in parts too few.
     """
     choice_key, motion_key = jax.random.split(key)
     choice = jax.random.uniform(choice_key)

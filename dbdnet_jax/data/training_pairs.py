@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int, PRNGKeyArray
 
-from dbdnet_jax.data.augment import make_varied_pair, require_enough_points
+from dbdnet_jax.data.augment import make_augmented_pair, require_enough_points
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.config import DataConfig
 from dbdnet_jax.data.modelnet40 import load_modelnet40
@@ -67,7 +67,7 @@ def load_training_pairs(
         protocol,
         seed=seed,
         validation_pairs=validation_pairs,
-        varied=data.varied,
+        augment=data.augment,
     )
 
 
@@ -94,11 +94,11 @@ def pairs_of_shapes(
     *,
     seed: int,
     validation_pairs: int,
-    varied: float = 0.0,
+    augment: float = 0.0,
 ) -> PairStream:
     """Pairs drawn on the device; every epoch sees every shape once, in an order of its own.
 
-    Of the training pairs a share of ``varied`` is drawn by `make_varied_pair`.
+    Of the training pairs a share of ``augment`` is drawn by `make_augmented_pair`.
 
     Raises:
         ValueError: no shape to train or to validate on, or shapes of too few points.
@@ -108,7 +108,7 @@ def pairs_of_shapes(
             "training and validation need at least one shape each; got "
             f"{len(train)} and {len(validation)}. Choose other config.data.categories."
         )
-    if varied:
+    if augment:
         require_enough_points(train.points.shape[1], protocol)
     count = len(train)
     order_key = jax.random.key(seed)
@@ -117,12 +117,12 @@ def pairs_of_shapes(
         order = jax.random.permutation(jax.random.fold_in(order_key, number // count), count)
         shape = points[order[number % count]]
         normals = jnp.zeros_like(shape)  # nothing trains on them
-        if not varied:
+        if not augment:
             return make_pair(key, shape, normals, protocol)
         choice_key, key = jax.random.split(key)
         return jax.lax.cond(
-            jax.random.uniform(choice_key) < varied,
-            lambda: make_varied_pair(key, shape, normals, protocol),
+            jax.random.uniform(choice_key) < augment,
+            lambda: make_augmented_pair(key, shape, normals, protocol),
             lambda: make_pair(key, shape, normals, protocol),
         )
 

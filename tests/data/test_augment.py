@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from dbdnet_jax.data import augment as varied
-from dbdnet_jax.data.augment import make_varied_pair
+from dbdnet_jax.data import augment
+from dbdnet_jax.data.augment import make_augmented_pair
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.pairs import Protocol
 
@@ -22,12 +22,12 @@ def shape():
 
 @pytest.fixture(scope="module")
 def pairs(shape):
-    """Many varied pairs of one shape, and the same without noise."""
+    """Many augmented pairs of one shape, and the same without noise."""
     keys = jax.random.split(jax.random.key(5), COUNT)
     points, normals = jnp.asarray(shape), jnp.zeros(shape.shape)
 
     def drawn(protocol):
-        draw = jax.jit(jax.vmap(lambda key: make_varied_pair(key, points, normals, protocol)))
+        draw = jax.jit(jax.vmap(lambda key: make_augmented_pair(key, points, normals, protocol)))
         return jax.device_get(draw(keys))
 
     return drawn(PROTOCOL), drawn(Protocol(points=512, noise_sigma=0.0))
@@ -92,12 +92,12 @@ def test_crops_leave_a_half_to_all_of_what_was_drawn_by_planes_and_by_balls(monk
 
         return crop
 
-    monkeypatch.setattr(varied, "half_space_crop", telling(0))
-    monkeypatch.setattr(varied, "ball_crop", telling(2))
+    monkeypatch.setattr(augment, "half_space_crop", telling(0))
+    monkeypatch.setattr(augment, "ball_crop", telling(2))
     monkeypatch.setattr(jax.random, "permutation", lambda key, n: jnp.arange(n))
     points = jnp.zeros((total, 3)).at[:4].set(jnp.eye(4, 3)).at[-4:].set(2 * jnp.eye(4, 3)[::-1])
     clean = Protocol(noise_sigma=0.0)
-    draw = jax.jit(jax.vmap(lambda key: make_varied_pair(key, points, points, clean)))
+    draw = jax.jit(jax.vmap(lambda key: make_augmented_pair(key, points, points, clean)))
     target = np.asarray(draw(jax.random.split(jax.random.key(8), COUNT)).target.points)
     # Of a disjoint pair the rows of the target count from the last point: of twice the length.
     rows = np.argmax(target > 0, axis=2) + 3 * (target.max(axis=2) == 0)
@@ -113,4 +113,4 @@ def test_crops_leave_a_half_to_all_of_what_was_drawn_by_planes_and_by_balls(monk
 def test_a_shape_of_too_few_points_is_refused():
     points = jnp.zeros((600, 3))
     with pytest.raises(ValueError, match="at least 716; got 600. Lower config.protocol.points"):
-        make_varied_pair(jax.random.key(0), points, points, PROTOCOL)
+        make_augmented_pair(jax.random.key(0), points, points, PROTOCOL)

@@ -154,7 +154,7 @@ def test_an_unknown_test_set_is_refused():
         cad_test_pairs("rain")
 
 
-def test_imperfect_overlap_is_now_true_now_everything_now_something_between(pairs):
+def test_perturbed_overlap_is_now_true_now_everything_now_something_between(pairs):
     pair = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), pairs)
     keys = jax.random.split(jax.random.key(9), 300)
     draw = jax.jit(jax.vmap(lambda key: perturbed_overlap(key, pair, 0.1)))

@@ -57,8 +57,8 @@ def test_a_share_of_the_pairs_is_drawn_more_widely():
     clean = dataclasses.replace(stand_in.PROTOCOL, noise_sigma=0.0)
     key, points = jax.random.key(0), jnp.asarray(shapes.points)
 
-    def radii(varied):
-        pairs = pairs_of_shapes(shapes, shapes, clean, seed=0, validation_pairs=1, varied=varied)
+    def radii(augment):
+        pairs = pairs_of_shapes(shapes, shapes, clean, seed=0, validation_pairs=1, augment=augment)
         draw = jax.jit(lambda n: pairs.draw(jax.random.fold_in(key, n), n, points).target.points)
         on_shape = cKDTree(points.reshape(-1, 3)).query
         return np.array([on_shape(draw(jnp.asarray(n)))[0].max() for n in range(60)])
@@ -71,7 +71,7 @@ def test_a_share_of_the_pairs_is_drawn_more_widely():
 def test_shapes_too_small_to_draw_widely_are_refused_before_anything_starts():
     shapes = stand_in.shapes(count=2, points=20)
     with pytest.raises(ValueError, match="points need shapes of at least 24; got 20"):
-        pairs_of_shapes(shapes, shapes, stand_in.PROTOCOL, seed=0, validation_pairs=1, varied=0.1)
+        pairs_of_shapes(shapes, shapes, stand_in.PROTOCOL, seed=0, validation_pairs=1, augment=0.1)
 
 
 def test_every_twentieth_modelnet_shape_is_held_out(tmp_path):
