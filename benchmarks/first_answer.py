@@ -39,13 +39,13 @@ def child(way: str) -> None:
     package = lap("package", lambda: __import__("dbdnet_jax"))
     import numpy as np
 
-    from dbdnet_jax.alignment.search import ask_network
+    from dbdnet_jax.alignment.search import predict_pose
     from dbdnet_jax.io.programs import keep_compiled_programs
 
     keep_compiled_programs()
     params = lap("weights", package.load_pretrained)
     points = np.random.default_rng(0).uniform(-0.6, 0.6, (2, 717, 3)).astype(np.float32)
-    register = jax.jit(package.register) if way == "register" else ask_network
+    register = jax.jit(package.register) if way == "register" else predict_pose
     for name in ("first", "second"):
         lap(name, lambda: jax.block_until_ready(register(params, *points)))
     print(json.dumps({name: round(seconds, 3) for name, seconds in laps.items()}))

@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 import numpy as np
 
 from dbdnet_jax.alignment.align import Alignment, Matches
-from dbdnet_jax.alignment.success import Evidence
+from dbdnet_jax.alignment.success import PoseFeatures
 from tests.aligning import pair
 
 HOSTILE = "</script><img src=x onerror=alert(1)>\"'&amp; $\\alpha{ caf\udce9.ply"
@@ -33,7 +33,7 @@ def by_hand(**changes) -> Alignment:
         matches=Matches(np.arange(MATCHED), nearest, np.linspace(1, 0, MATCHED)),
         information=np.eye(6),
         pivot=np.zeros(3),
-        evidence=Evidence(*np.zeros(len(Evidence._fields))),
+        evidence=PoseFeatures(*np.zeros(len(PoseFeatures._fields))),
         timings={"network": 1.25, "refine": 0.5},
     )
     return dataclasses.replace(alignment, **changes)

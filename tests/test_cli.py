@@ -95,7 +95,9 @@ def test_the_moved_source_is_saved(run, tmp_path):
 
 
 def test_no_refinement_is_asked_for(run, monkeypatch):
-    monkeypatch.setattr("dbdnet_jax.alignment.search.best_rival", lambda *_: pytest.fail("judged"))
+    monkeypatch.setattr(
+        "dbdnet_jax.alignment.search.strongest_alternative", lambda *_: pytest.fail("judged")
+    )
     refined = []
     monkeypatch.setattr(
         "dbdnet_jax.alignment.search.refine", lambda pose, *_: refined.append(1) or pose

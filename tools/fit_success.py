@@ -24,7 +24,7 @@ from dbdnet_jax.alignment.success import (
     SUCCESS_DEG,
     SUCCESS_FILE,
     Coefficients,
-    Evidence,
+    PoseFeatures,
     load_coefficients,
 )
 from dbdnet_jax.alignment.success import success_probability as probability_of
@@ -42,7 +42,9 @@ PROTOCOLS = (Protocol(), Protocol(noise_sigma=0.0), Protocol(disjoint=True))
 SEED = 77
 ALIGN = importlib.import_module("dbdnet_jax.alignment.align")  # not the function of that name
 FOLDS, BINS = 5, 10
-NOTHING = Coefficients(*(Evidence(*[x] * len(Evidence._fields)) for x in (0.0, 1.0, 0.0)), bias=0.0)
+NOTHING = Coefficients(
+    *(PoseFeatures(*[x] * len(PoseFeatures._fields)) for x in (0.0, 1.0, 0.0)), bias=0.0
+)
 RIDGE = 1.0  # on the weights of standardised evidence, in units of one pair's loss
 
 
@@ -68,7 +70,7 @@ def test_pairs(variant: str) -> Iterator[tuple[int, Pair]]:
 
 
 def examine(params: Params, pairs: Iterator[tuple[int, Pair]], count: int):
-    """Evidence (n, fields), success (n,), shape numbers (n,), rotation errors (n,) in degrees."""
+    """Features (n, fields), success (n,), shape numbers (n,), rotation errors (n,) in degrees."""
     rows, shapes, errors = [], [], []
     for shape, pair in tqdm(pairs, total=count):
         # The coefficients at hand may be of other evidence, and are what is to be made here.
@@ -93,7 +95,7 @@ def fit(evidence: np.ndarray, success: np.ndarray) -> dict:
 
     w = minimize(loss, np.zeros(x.shape[1]), method="BFGS").x
     parts = {"mean": mean, "deviation": deviation, "weight": w[:-1]}
-    named = {k: Evidence(*map(float, v))._asdict() for k, v in parts.items()}
+    named = {k: PoseFeatures(*map(float, v))._asdict() for k, v in parts.items()}
     return named | {"bias": float(w[-1])}
 
 
@@ -157,7 +159,7 @@ def main() -> None:
         found = []
         for variant in VARIANTS:
             evidence, success, _, _ = examine(params, test_pairs(variant), TEST_PAIRS)
-            probability = np.array([probability_of(Evidence(*row), held) for row in evidence])
+            probability = np.array([probability_of(PoseFeatures(*row), held) for row in evidence])
             print(f"\n{variant}:")
             show(probability, success)
             found.append((probability, success))

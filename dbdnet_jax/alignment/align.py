@@ -9,18 +9,23 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dbdnet_jax.alignment import search
-from dbdnet_jax.alignment.quality import coincidence, inlier_distance, judge
-from dbdnet_jax.alignment.scene import (
-    Scene,
-    Side,
+from dbdnet_jax.alignment.normalised import (
+    NormalisedCloud,
+    NormalisedPair,
     as_given,
-    build_scene,
-    guess_in_scene,
-    is_whole,
+    is_full_resolution,
+    normalise_pair,
+    normalised_guess,
 )
-from dbdnet_jax.alignment.search import Proposal, Transform
-from dbdnet_jax.alignment.success import Evidence, gather, load_coefficients, success_probability
-from dbdnet_jax.alignment.validity import doubt, warnings
+from dbdnet_jax.alignment.quality import assess_pose, inlier_distance, shared_point_score
+from dbdnet_jax.alignment.search import NetworkPose, Transform
+from dbdnet_jax.alignment.success import (
+    PoseFeatures,
+    gather,
+    load_coefficients,
+    success_probability,
+)
+from dbdnet_jax.alignment.validity import rejection_reason, warnings
 from dbdnet_jax.io.point_files import read_points
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import load_pretrained
@@ -61,7 +66,7 @@ class Alignment:
     matches: Matches = dataclasses.field(repr=False)
     information: Float[np.ndarray, "6 6"] = dataclasses.field(repr=False)
     pivot: Float[np.ndarray, "3"] = dataclasses.field(repr=False)
-    evidence: Evidence
+    evidence: PoseFeatures
     timings: dict[str, float]
 
     @property
@@ -123,20 +128,20 @@ def align(
     config = dataclasses.replace(params.config, overlap_threshold=float(overlap_threshold))
     params = dataclasses.replace(params, config=config)
     laps["weights"] = time.perf_counter()
-    scene = build_scene(*given, scale, max_points, guess)
-    laps["thin"] = time.perf_counter()
-    proposal = search.ask_network(params, scene.source.sparse, scene.target.sparse)
+    scene = normalise_pair(*given, scale, max_points, guess)
+    laps["downsample"] = time.perf_counter()
+    predicted = search.predict_pose(params, scene.source.sparse, scene.target.sparse)
     laps["network"] = time.perf_counter()
     distance = inlier_distance(scene.source.dense, scene.target.dense)
-    starts = [proposal.transform]
+    starts = [predicted.transform]
     if initial is not None:
-        starts.append(guess_in_scene(scene))
-    pose = _elect(starts, scene, refine)
+        starts.append(normalised_guess(scene))
+    pose = _select_pose(starts, scene, refine)
     laps["refine"] = time.perf_counter()
-    return _report(scene, proposal, pose, distance, laps)
+    return _report(scene, predicted, pose, distance, laps)
 
 
-def _elect(starts: list[Transform], scene: Scene, refine: bool) -> Transform:
+def _select_pose(starts: list[Transform], scene: NormalisedPair, refine: bool) -> Transform:
     """The pose that fits best; if asked for, refined on few points, then on all that are kept."""
     clouds = scene.source.sparse, scene.target.sparse
     if refine:
@@ -146,25 +151,29 @@ def _elect(starts: list[Transform], scene: Scene, refine: bool) -> Transform:
         return search.refine(best, scene.source.dense, scene.target.dense)
     if len(starts) == 1:
         return starts[0]
-    return min(starts, key=lambda pose: search.misfit(pose, *clouds))
+    return min(starts, key=lambda pose: search.truncated_rmse(pose, *clouds))
 
 
 def _report(
-    scene: Scene, proposal: Proposal, pose: Transform, distance: float, laps: dict[str, float]
+    scene: NormalisedPair,
+    predicted: NetworkPose,
+    pose: Transform,
+    distance: float,
+    laps: dict[str, float],
 ) -> Alignment:
     """Everything that is known of a pose, in the units and rows of the clouds as given."""
     clouds = scene.source.sparse, scene.target.sparse
     dense = search.move(pose, scene.source.dense), scene.target.dense
-    judgement = judge(*dense, distance)
-    rival = search.best_rival(pose, *clouds)
-    shared = coincidence(*dense, distance) if is_whole(scene) else 0.0
-    evidence = gather(proposal, pose, judgement, rival, shared)
+    quality = assess_pose(*dense, distance)
+    alternative = search.strongest_alternative(pose, *clouds)
+    shared = shared_point_score(*dense, distance) if is_full_resolution(scene) else 0.0
+    evidence = gather(predicted, pose, quality, alternative, shared)
     probability = success_probability(evidence, load_coefficients())
-    reason = doubt(scene, proposal, judgement, probability)
-    laps["judge"] = time.perf_counter()
+    reason = rejection_reason(scene, predicted, quality, probability)
+    laps["quality"] = time.perf_counter()
     overlap = (
-        _everywhere(scene.source, proposal.source_overlap),
-        _everywhere(scene.target, proposal.target_overlap),
+        _everywhere(scene.source, predicted.source_overlap),
+        _everywhere(scene.target, predicted.target_overlap),
     )
     laps["overlap"] = time.perf_counter()
     unit = np.repeat([1.0, scene.factor], 3)
@@ -173,40 +182,40 @@ def _report(
         valid=not reason,
         reason=reason,
         success_probability=probability,
-        warnings=tuple(warnings(scene, judgement, rival)),
-        inlier_ratio=float(judgement.inlier.mean()),
+        warnings=tuple(warnings(scene, quality, alternative)),
+        inlier_ratio=float(quality.inlier.mean()),
         inlier_distance=distance / scene.factor,
-        rmse=judgement.rmse / scene.factor,
+        rmse=quality.rmse / scene.factor,
         source_overlap=overlap[0],
         target_overlap=overlap[1],
-        matches=_matches(proposal, scene),
-        information=judgement.information * unit * unit[:, None],
-        pivot=judgement.pivot / scene.factor + scene.target.thinned.centre,
+        matches=_matches(predicted, scene),
+        information=quality.information * unit * unit[:, None],
+        pivot=quality.pivot / scene.factor + scene.target.downsampled.centre,
         evidence=evidence,
         timings={name: end - start for (_, start), (name, end) in itertools.pairwise(laps.items())},
     )
 
 
-def _everywhere(side: Side, values: Float[np.ndarray, " s"]) -> Float[np.ndarray, " n"]:
+def _everywhere(side: NormalisedCloud, values: Float[np.ndarray, " s"]) -> Float[np.ndarray, " n"]:
     """Every given point gets the value of the nearest point that the network saw."""
     from scipy.spatial import cKDTree
 
-    tree = cKDTree(side.points[side.thinned.sparse] - side.thinned.centre)
+    tree = cKDTree(side.points[side.downsampled.sparse] - side.downsampled.centre)
     blocks = np.array_split(side.points, len(side.points) // 1_000_000 + 1)
-    rows = [tree.query(block - side.thinned.centre, workers=-1)[1] for block in blocks]
+    rows = [tree.query(block - side.downsampled.centre, workers=-1)[1] for block in blocks]
     return values[np.concatenate(rows)]
 
 
-def _matches(proposal: Proposal, scene: Scene) -> Matches:
+def _matches(predicted: NetworkPose, scene: NormalisedPair) -> Matches:
     """Pairs of points that are each other's heaviest, heaviest first."""
-    forth, back = proposal.mass.argmax(axis=1), proposal.mass.argmax(axis=0)
-    mutual = (back[forth] == np.arange(len(forth))) & (proposal.mass.max(axis=1) > 0)
+    forth, back = predicted.mass.argmax(axis=1), predicted.mass.argmax(axis=0)
+    mutual = (back[forth] == np.arange(len(forth))) & (predicted.mass.max(axis=1) > 0)
     rows = np.flatnonzero(mutual)
-    rows = rows[np.argsort(-proposal.mass[rows, forth[rows]], kind="stable")]
+    rows = rows[np.argsort(-predicted.mass[rows, forth[rows]], kind="stable")]
     return Matches(
-        scene.source.thinned.sparse[rows],
-        scene.target.thinned.sparse[forth[rows]],
-        proposal.mass[rows, forth[rows]],
+        scene.source.downsampled.sparse[rows],
+        scene.target.downsampled.sparse[forth[rows]],
+        predicted.mass[rows, forth[rows]],
     )
 
 

@@ -116,7 +116,7 @@ def _agree(
     alignments: dict[tuple[int, int], Alignment],
 ) -> MultiAlignment:
     """Consistent poses out of the alignments of pairs."""
-    # Distant or large coordinates would cost the optimiser its digits; medians forget strays.
+    # Distant or large coordinates would cost the optimiser its digits; medians forget outliers.
     centres = [np.median(cloud, axis=0) for cloud in points]
     pairs = zip(points, centres, strict=True)
     sizes = [np.median(np.linalg.norm(cloud - centre, axis=1)) for cloud, centre in pairs]

@@ -9,30 +9,30 @@ Points = Float[np.ndarray, "n 3"]
 Rows = Int[np.ndarray, " k"]
 Fewer = Int[np.ndarray, " j"]
 
-DENSE = 10_000  # points that a pose is refined and judged on; nothing is thinned below
+DENSE = 10_000  # points that a pose is refined and judged on; nothing is downsampled below
 BLOCK = 1_000_000  # rows that a grid thins at once: bounds the memory
 SAMPLE = 200_000  # rows that decide a grid's step
 MAX_CELLS = 4096  # along an axis: twelve bits
-STRAY = 3.0  # points farther from the middle than this times the size are left out
+OUTLIER_DISTANCE = 3.0  # points farther from the middle than this times the size are left out
 # The size of a partial scan of a shape in the unit sphere: the median of the larger one of a pair
 # under the paper's protocol, on the training shapes. Its logarithm varies by 0.12.
 UNIT_SIZE = 0.95
 
 
-class Thinned(NamedTuple):
+class Downsampled(NamedTuple):
     """Rows of a cloud: ``dense`` for judging a pose, ``sparse`` of them for the network.
 
-    ``centre`` (3,) and ``size`` describe the cloud without strays, in its own unit.
+    ``centre`` (3,) and ``size`` describe the cloud without outliers, in its own unit.
     """
 
     dense: Rows
     sparse: Fewer
     centre: Float[np.ndarray, "3"]
     size: float
-    strays: int
+    outliers: int
 
 
-def thin(points: Points, sparse: int, dense: int = DENSE) -> Thinned:
+def downsample(points: Points, sparse: int, dense: int = DENSE) -> Downsampled:
     """Choose rows: a voxel grid down to ``dense``, farthest points down to ``sparse``.
 
     The choice does not depend on the order of the rows, but for the grid's step above `SAMPLE`
@@ -40,16 +40,16 @@ def thin(points: Points, sparse: int, dense: int = DENSE) -> Thinned:
     """
     middle = np.median(points, axis=0)
     distance = np.linalg.norm(points - middle, axis=1)
-    reach = STRAY * float(np.quantile(distance, 0.98))
+    reach = OUTLIER_DISTANCE * float(np.quantile(distance, 0.98))
     rows = np.flatnonzero(distance <= reach)
-    strays = len(points) - len(rows)
+    outliers = len(points) - len(rows)
     if len(rows) > dense:
         rows = _grid(points, rows, middle, reach, dense)
     middle = points[rows].mean(axis=0)
     chosen = rows[farthest_rows(points[rows] - middle, sparse)]
     centre = points[chosen].mean(axis=0)
     size = np.quantile(np.linalg.norm(points[chosen] - centre, axis=1), 0.98)
-    return Thinned(rows, chosen, centre, float(size), strays)
+    return Downsampled(rows, chosen, centre, float(size), outliers)
 
 
 def _grid(points: Points, rows: Rows, middle: np.ndarray, reach: float, dense: int) -> Fewer:

@@ -17,10 +17,10 @@ NEAREST_INLIER = 0.03  # of the unit: noise and the last error of a pose, for de
 NORMAL_NEIGHBOURS = 16  # at least; of dense clouds a 250th part, to reach beyond their noise
 # A motion is free when it changes the distances between the surfaces by less than this part of
 # itself (root mean square); estimated normals of a noisy plane vary by about half of it.
-FREE = 0.1
-# Of `coincidence`: how near to 1 the ratio of distances is in 19 of 20 wrong poses of validation
-# pairs (being an inlier favours the point's own distance), and points that are enough to tell.
-UNRELATED = 0.95
+DEGENERATE = 0.1
+# Of `shared_point_score`: how near to 1 the ratio of distances is in 19 of 20 wrong poses of
+# validation pairs (being an inlier favours the point's own distance), and points that are enough to tell.
+CHANCE_RATIO = 0.95
 ENOUGH_INLIERS = 1000
 
 
@@ -31,13 +31,13 @@ class Motion(NamedTuple):
     direction: Direction
 
 
-class Judgement(NamedTuple):
+class PoseQuality(NamedTuple):
     """Source points (n) against the surface of the target.
 
     ``inlier[i]``: source point i has a target point within ``distance``. ``rmse`` is over these
     pairs, ``plane_rmse`` over their distances along the target's normals. ``information`` (6, 6)
     is that of the latter for a small rotation about ``pivot`` and a small translation, the
-    noise's variance taken from the residuals; ``stiffness`` its smallest part per point, scaled
+    noise's variance taken from the residuals; ``min_eigenvalue`` its smallest part per point, scaled
     to 0 (free) .. 1/3 (held the same from all sides).
     """
 
@@ -47,8 +47,8 @@ class Judgement(NamedTuple):
     plane_rmse: float
     information: Float[np.ndarray, "6 6"]
     pivot: Direction
-    stiffness: float
-    free: tuple[Motion, ...]
+    min_eigenvalue: float
+    degenerate_motions: tuple[Motion, ...]
 
 
 def inlier_distance(source: Points, target: OtherPoints) -> float:
@@ -65,7 +65,7 @@ def _spacing(points: Points, tree: Any) -> float:
     return float(np.median(tree.query(points, k=2)[0][:, 1]))
 
 
-def judge(moved: Points, target: OtherPoints, distance: float) -> Judgement:
+def assess_pose(moved: Points, target: OtherPoints, distance: float) -> PoseQuality:
     """Compare a moved source with a target; fewer than six inliers leave every motion free."""
     from scipy.spatial import cKDTree
 
@@ -75,7 +75,7 @@ def judge(moved: Points, target: OtherPoints, distance: float) -> Judgement:
     if inlier.sum() < 6:
         axes = [Motion(kind, axis) for kind in ("rotation", "translation") for axis in np.eye(3)]
         nothing = np.zeros((6, 6)), moved.mean(axis=0), 0.0, tuple(axes)
-        return Judgement(inlier, distance, np.inf, np.inf, *nothing)
+        return PoseQuality(inlier, distance, np.inf, np.inf, *nothing)
     points, rows = moved[inlier], rows[inlier]
     normals = surface_normals(target, tree, rows)
     residual = ((points - target[rows]) * normals).sum(axis=1)
@@ -86,25 +86,25 @@ def judge(moved: Points, target: OtherPoints, distance: float) -> Judgement:
     held = jacobian.T @ jacobian
     length = max(float(np.sqrt((arm**2).sum(axis=1).mean())), 1e-12)
     unit = np.repeat([1 / length, 1.0], 3)
-    stiffness, free = _free_motions(held * unit * unit[:, None] / len(points))
-    return Judgement(
+    min_eigenvalue, degenerate = _degenerate_motions(held * unit * unit[:, None] / len(points))
+    return PoseQuality(
         inlier,
         distance,
         float(np.sqrt(np.mean(found[inlier] ** 2))),
         plane_rmse,
         held / max(plane_rmse, 1e-6) ** 2,
         pivot,
-        stiffness,
-        free,
+        min_eigenvalue,
+        degenerate,
     )
 
 
-def coincidence(moved: Points, target: OtherPoints, distance: float) -> float:
+def shared_point_score(moved: Points, target: OtherPoints, distance: float) -> float:
     """How much closer the inliers are to points of the target than a spacing beside them.
 
-    From 0 to `UNRELATED`. Two drawings of one surface leave it at 0 in any pose; points that both
+    From 0 to `CHANCE_RATIO`. Two drawings of one surface leave it at 0 in any pose; points that both
     clouds have in common show, and in the right pose only, even where the shape is symmetric. Not
-    for clouds that a grid has thinned: its cells may coincide.
+    for clouds that a grid has downsampled: its cells may coincide.
     """
     from scipy.spatial import cKDTree
 
@@ -121,7 +121,7 @@ def coincidence(moved: Points, target: OtherPoints, distance: float) -> float:
     steps = np.stack([along, -along, np.cross(normals, along), np.cross(along, normals)])
     beside = np.minimum(tree.query(moved[inliers] + steps)[0], distance)
     usual = max(float(np.sqrt(np.mean(beside**2))), 1e-12)  # 0 where the target is one place
-    return max(UNRELATED - float(np.sqrt(np.mean(found[inliers] ** 2))) / usual, 0.0)
+    return max(CHANCE_RATIO - float(np.sqrt(np.mean(found[inliers] ** 2))) / usual, 0.0)
 
 
 def surface_normals(
@@ -135,20 +135,20 @@ def surface_normals(
     return np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))[1][:, :, 0]
 
 
-def _free_motions(held: Float[np.ndarray, "6 6"]) -> tuple[float, tuple[Motion, ...]]:
-    """The smallest eigenvalue of ``held``, and the motions whose eigenvalue is below FREE^2.
+def _degenerate_motions(held: Float[np.ndarray, "6 6"]) -> tuple[float, tuple[Motion, ...]]:
+    """The smallest eigenvalue of ``held``, and the motions whose eigenvalue is below DEGENERATE^2.
 
     Translations first; rotations are then judged with the best translation beside each, so that
     a rotation about an axis elsewhere is found too.
     """
     values, axes = np.linalg.eigh(held[3:, 3:])
-    slack = values < FREE**2
+    slack = values < DEGENERATE**2
     motions = [Motion("translation", axis) for axis in axes.T[slack]]
     stiff = axes[:, ~slack]
     coupling = held[:3, 3:] @ stiff
     about = held[:3, :3] - coupling @ np.diag(1 / values[~slack]) @ coupling.T
     turning, turns = np.linalg.eigh(about)
-    motions += [Motion("rotation", axis) for axis in turns.T[turning < FREE**2]]
+    motions += [Motion("rotation", axis) for axis in turns.T[turning < DEGENERATE**2]]
     return float(np.linalg.eigvalsh(held)[0]), tuple(motions)
 
 

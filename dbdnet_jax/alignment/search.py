@@ -1,4 +1,4 @@
-"""Poses of one pair at the network's scale: the network's own, refined ones, and their rivals."""
+"""Poses of one pair at the network's scale: the network's, refined ones, alternatives."""
 
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -22,14 +22,14 @@ Transform = Float[np.ndarray, "4 4"]
 SMALLEST_BUCKET = 192
 FAR_DEG = (90.0, 180.0, 270.0)  # turns of symmetric shapes tell of doubt, and are not followed
 CAP_PER_DISTANCE = 0.7  # the cap of residuals, per distance of inliers
-DIFFERENT_DEG = 15.0  # from the pose, of what counts as a rival
-NO_RIVAL = 3.0  # the margin where there is none
-CROWD_MARGIN = 0.5  # a rival whose misfit is larger by this logarithm counts as 1/e of one
+DIFFERENT_DEG = 15.0  # from the pose, of what counts as a alternative
+NO_ALTERNATIVE = 3.0  # the margin where there is none
+ALTERNATIVE_MARGIN = 0.5  # one whose truncated RMSE is larger by this logarithm counts as 1/e
 
 _PROGRAMS: dict[tuple[str, tuple], Callable] = {}  # by name and shapes, as jax.jit keeps its own
 
 
-class Proposal(NamedTuple):
+class NetworkPose(NamedTuple):
     """The network's answer, a row for every point it was given; see `types.Registration`."""
 
     transform: Transform
@@ -41,22 +41,22 @@ class Proposal(NamedTuple):
     valid: bool
 
 
-class Rival(NamedTuple):
-    """The best other pose: how it differs, and the logarithm of its misfit per that of the pose.
+class AlternativePose(NamedTuple):
+    """The best other pose: how it differs, and the logarithm of its truncated RMSE per the pose's.
 
-    ``crowd`` counts the turns that end in another pose: one that fits as well or better as 1, the
-    others as ``exp(-margin / 0.5)``. ``drift_deg`` is how far refining it once more moves the pose
-    itself: little, where it is well held.
+    ``alternatives`` counts the turns that end in another pose: one that fits as well or better
+    as 1, the others as ``exp(-margin / 0.5)``. ``refinement_drift_deg`` is how far refining it once
+    more moves the pose itself: little, where it is well held.
     """
 
     angle_deg: float
     axis: Float[np.ndarray, "3"]
     margin: float
-    crowd: float
-    drift_deg: float
+    alternatives: float
+    refinement_drift_deg: float
 
 
-def ask_network(params: Params, source: Points, target: OtherPoints) -> Proposal:
+def predict_pose(params: Params, source: Points, target: OtherPoints) -> NetworkPose:
     """Register two clouds of any size; programs are compiled for a few sizes only."""
     config = params.config
 
@@ -79,7 +79,7 @@ def ask_network(params: Params, source: Points, target: OtherPoints) -> Proposal
     answer = _run(repr(config), network, weights, *_pad(source, target))
     rotation, translation, source_overlap, target_overlap, kept, mass, confidence, valid = answer
     n, m = len(source), len(target)
-    return Proposal(
+    return NetworkPose(
         as_transform(rotation, translation),
         source_overlap[:n],
         target_overlap[:m],
@@ -103,20 +103,20 @@ def _even(points: Points) -> Float[np.ndarray, "k 3"]:
 
 
 def explore(pose: Transform, source: Points, target: OtherPoints) -> tuple[Transform, float]:
-    """The refined pose, or a refined neighbour of it that fits clearly better; and its misfit."""
+    """The refined pose, or a refined neighbour of it that fits clearly better; and its RMSE."""
     rotation, translation, residual, _ = _run_polish(polish.explore, pose, source, target)
     return as_transform(rotation, translation), float(residual)
 
 
-def misfit(pose: Transform, source: Points, target: OtherPoints) -> float:
+def truncated_rmse(pose: Transform, source: Points, target: OtherPoints) -> float:
     """How badly a pose fits: the `residual`, a length."""
     return float(_run_polish(polish.residual, pose, source, target)[0])
 
 
-def best_rival(pose: Transform, source: Points, target: OtherPoints) -> Rival:
+def strongest_alternative(pose: Transform, source: Points, target: OtherPoints) -> AlternativePose:
     """The best other pose among the refined turns of this one.
 
-    A turn that falls back to the pose itself, or to what refining would make of it, is no rival.
+    A turn that falls back to the pose itself, or to what refining would make of it, is none.
     """
     *motions, residuals, _, own = _run_polish(_all_turns, pose, source, target)
     cap = _cap(source, target)
@@ -124,13 +124,13 @@ def best_rival(pose: Transform, source: Points, target: OtherPoints) -> Rival:
     others = [as_transform(*motion) for motion in zip(*motions, strict=True)]
     angles, axes = zip(*(angle_between(other, pose) for other in others), strict=True)
     apart = [angle_between(other, others[0])[0] for other in others]
-    rivals = np.flatnonzero(np.minimum(angles, apart) > DIFFERENT_DEG)
-    if not rivals.size:
-        return Rival(180.0, np.eye(3)[0], NO_RIVAL, 0.0, angles[0])
-    best = rivals[np.argmin(margins[rivals])]
-    crowd = np.exp(-np.maximum(margins[rivals], 0.0) / CROWD_MARGIN).sum()
-    margin = min(float(margins[best]), NO_RIVAL)
-    return Rival(angles[best], axes[best], margin, float(crowd), angles[0])
+    others_apart = np.flatnonzero(np.minimum(angles, apart) > DIFFERENT_DEG)
+    if not others_apart.size:
+        return AlternativePose(180.0, np.eye(3)[0], NO_ALTERNATIVE, 0.0, angles[0])
+    best = others_apart[np.argmin(margins[others_apart])]
+    count = np.exp(-np.maximum(margins[others_apart], 0.0) / ALTERNATIVE_MARGIN).sum()
+    margin = min(float(margins[best]), NO_ALTERNATIVE)
+    return AlternativePose(angles[best], axes[best], margin, float(count), angles[0])
 
 
 def _all_turns(

@@ -11,50 +11,54 @@ from typing import NamedTuple
 
 import numpy as np
 
-from dbdnet_jax.alignment.quality import Judgement
-from dbdnet_jax.alignment.search import Proposal, Rival, Transform, angle_between
+from dbdnet_jax.alignment.quality import PoseQuality
+from dbdnet_jax.alignment.search import AlternativePose, NetworkPose, Transform, angle_between
 from dbdnet_jax.networks.weights import PRETRAINED
 
 SUCCESS_FILE = PRETRAINED / "cad_success.json"
 SUCCESS_DEG = 5.0  # a pose is right when its rotation is off by less
 
 
-class Evidence(NamedTuple):
+class PoseFeatures(NamedTuple):
     """What speaks for or against a pose; every entry free of units."""
 
-    residual: float  # distance along the normals, root mean square, per inlier distance
-    coincidence: float  # of points that both clouds have in common, see `quality.coincidence`
-    sureness: float  # mean distance of the overlap probabilities from one half
-    stiffness: float  # logarithm of the least held motion's stiffness
-    correction: float  # logarithm of 1 + degrees between the network's pose and the refined one
-    drift: float  # the same between the pose and what refining it once more makes of it
-    rival: float  # logarithm of the best rival pose's misfit per this one's misfit
-    crowd: float  # how many turns of the pose end in another one that fits about as well
+    plane_rmse: float  # distance along the normals, root mean square, per inlier distance
+    shared_point_score: float  # whether the clouds have points in common, see `quality`
+    overlap_confidence: float  # mean distance of the overlap probabilities from one half
+    min_eigenvalue: float  # logarithm of the least held motion's eigenvalue
+    refinement_angle: float  # logarithm of 1 + degrees from the network's pose to the refined one
+    refinement_drift: float  # the same between the pose and what refining it once more makes of it
+    ambiguity_margin: float  # logarithm of the best alternative's truncated RMSE per this pose's
+    ambiguity_count: float  # how many turns of the pose end in another one that fits about as well
 
 
 def gather(
-    proposal: Proposal, pose: Transform, judgement: Judgement, rival: Rival, coincidence: float
-) -> Evidence:
+    predicted: NetworkPose,
+    pose: Transform,
+    quality: PoseQuality,
+    alternative: AlternativePose,
+    shared_point_score: float,
+) -> PoseFeatures:
     """The evidence for a pose."""
-    predicted = proposal.source_overlap, proposal.target_overlap
-    return Evidence(
-        residual=min(judgement.plane_rmse / judgement.distance, 1.0),
-        coincidence=coincidence,
-        sureness=float(np.mean([np.abs(p - 0.5).mean() for p in predicted])),
-        stiffness=math.log(max(judgement.stiffness, 1e-6)),
-        correction=math.log1p(angle_between(pose, proposal.transform)[0]),
-        drift=math.log1p(rival.drift_deg),
-        rival=rival.margin,
-        crowd=rival.crowd,
+    overlap = predicted.source_overlap, predicted.target_overlap
+    return PoseFeatures(
+        plane_rmse=min(quality.plane_rmse / quality.distance, 1.0),
+        shared_point_score=shared_point_score,
+        overlap_confidence=float(np.mean([np.abs(p - 0.5).mean() for p in overlap])),
+        min_eigenvalue=math.log(max(quality.min_eigenvalue, 1e-6)),
+        refinement_angle=math.log1p(angle_between(pose, predicted.transform)[0]),
+        refinement_drift=math.log1p(alternative.refinement_drift_deg),
+        ambiguity_margin=alternative.margin,
+        ambiguity_count=alternative.alternatives,
     )
 
 
 class Coefficients(NamedTuple):
     """Of the regression on standardised evidence: ``(x - mean) / deviation``."""
 
-    mean: Evidence
-    deviation: Evidence
-    weight: Evidence
+    mean: PoseFeatures
+    deviation: PoseFeatures
+    weight: PoseFeatures
     bias: float
 
 
@@ -68,9 +72,9 @@ def load_coefficients(path: Path = SUCCESS_FILE) -> Coefficients:
     try:
         held = json.loads(path.read_text())
         return Coefficients(
-            mean=Evidence(**held["mean"]),
-            deviation=Evidence(**held["deviation"]),
-            weight=Evidence(**held["weight"]),
+            mean=PoseFeatures(**held["mean"]),
+            deviation=PoseFeatures(**held["deviation"]),
+            weight=PoseFeatures(**held["weight"]),
             bias=float(held["bias"]),
         )
     except (ValueError, KeyError, TypeError) as error:
@@ -80,7 +84,7 @@ def load_coefficients(path: Path = SUCCESS_FILE) -> Coefficients:
         ) from error
 
 
-def success_probability(evidence: Evidence, coefficients: Coefficients) -> float:
+def success_probability(evidence: PoseFeatures, coefficients: Coefficients) -> float:
     """Probability that the rotation is off by less than `SUCCESS_DEG` degrees."""
     mean, deviation, weight, bias = coefficients
     terms = zip(evidence, mean, deviation, weight, strict=True)

@@ -9,8 +9,8 @@ from dbdnet_jax.alignment.align import Alignment
 from dbdnet_jax.alignment.quality import written
 from dbdnet_jax.drawing import figures
 from dbdnet_jax.drawing.page import Markup, card, grid, page, plot, table, tag
+from dbdnet_jax.drawing.selection import DrawnPair, select_points
 from dbdnet_jax.drawing.style import SOURCE, TARGET
-from dbdnet_jax.drawing.view import View, look
 
 Points = Float[np.ndarray, "n 3"]
 OtherPoints = Float[np.ndarray, "m 3"]
@@ -28,7 +28,7 @@ def alignment_page(
 
     ``names`` are the clouds' files, ``command`` what made the alignment; both may be any text.
     """
-    view = look(alignment, source, target)
+    drawn = select_points(alignment, source, target)
     return page(
         f"{names[0]} onto {names[1]}: {alignment.verdict}",
         tag(
@@ -40,11 +40,11 @@ def alignment_page(
         _tiles(alignment),
         *([card("Warnings", _list(alignment.warnings))] if alignment.warnings else []),
         grid(
-            *_plots(alignment, view),
+            *_plots(alignment, drawn),
             tag(
                 "div",
                 card("Transform", *_transform(alignment)),
-                card("Clouds", *_clouds(names, (source, target), view)),
+                card("Clouds", *_clouds(names, (source, target), drawn)),
                 css="stack",
             ),
         ),
@@ -79,25 +79,25 @@ def _turn(alignment: Alignment) -> tuple[str, str]:
     return f"{angle:.3g}°", f"rotation, about {written(vector / max(angle, 1e-12))}"
 
 
-def _plots(alignment: Alignment, view: View) -> Iterator[Markup]:
+def _plots(alignment: Alignment, drawn: DrawnPair) -> Iterator[Markup]:
     """The figures, each in its card."""
     together = "The clouds as given."
-    if view.apart:
+    if drawn.apart:
         together = "The clouds lie too far apart for one picture: each is about its own middle."
-    drawn, held = len(view.match), len(alignment.matches.confidence)
+    shown, held = len(drawn.match), len(alignment.matches.confidence)
     near = f"{alignment.inlier_distance:.3g}"
-    yield plot("Before", together, figures.two_clouds(view.before, view.target))
+    yield plot("Before", together, figures.two_clouds(drawn.before, drawn.target))
     moved = "The source as moved by the transform."
-    yield plot("After", moved, figures.two_clouds(view.after, view.target))
+    yield plot("After", moved, figures.two_clouds(drawn.after, drawn.target))
     dark = "After; the dark points are likely to have a counterpart in the other cloud."
-    yield plot("Overlap", dark, figures.overlap(view))
+    yield plot("Overlap", dark, figures.overlap(drawn))
     lines = (
-        f"The {drawn} most confident of the network's {held} matches, the aligned source moved "
+        f"The {shown} most confident of the network's {held} matches, the aligned source moved "
         f"aside. Those agree whose ends the transform brings within {near}."
     )
-    yield plot("Matches", lines if held else "There are none.", figures.matches(view))
+    yield plot("Matches", lines if held else "There are none.", figures.matches(drawn))
     far = "Of the moved source from the target; what lies outside the overlap is far."
-    yield plot("Residuals", far, figures.residuals(view, alignment.inlier_distance))
+    yield plot("Residuals", far, figures.residuals(drawn, alignment.inlier_distance))
 
 
 def _transform(alignment: Alignment) -> Iterator[Markup]:
@@ -111,10 +111,10 @@ def _transform(alignment: Alignment) -> Iterator[Markup]:
 
 
 def _clouds(
-    names: tuple[str, str], clouds: tuple[Points, OtherPoints], view: View
+    names: tuple[str, str], clouds: tuple[Points, OtherPoints], drawn: DrawnPair
 ) -> Iterator[Markup]:
     """Files and sizes, and how many of the points are drawn."""
-    sides = (("source", SOURCE, view.after), ("target", TARGET, view.target))
+    sides = (("source", SOURCE, drawn.after), ("target", TARGET, drawn.target))
     body = [
         (
             Markup(f'<span class="swatch" style="background:{colour}"></span>{role}'),
@@ -126,7 +126,7 @@ def _clouds(
         for (role, colour, drawn), name, points in zip(sides, names, clouds, strict=True)
     ]
     yield table(("cloud", "file", "points", "drawn", "extent in x, y, z"), body, css="names")
-    origin = ", ".join(f"{x:.6g}" for x in view.origin)
+    origin = ", ".join(f"{x:.6g}" for x in drawn.origin)
     yield tag(
         "p",
         "Drawn are the points that the pose was judged on: all of a small cloud, an even choice "

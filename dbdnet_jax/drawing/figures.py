@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from dbdnet_jax.drawing.selection import Corner, DrawnPair, box
 from dbdnet_jax.drawing.style import BAD, CURVES, DASHES, GOOD, NEUTRAL, OVERLAP, SOURCE, TARGET
-from dbdnet_jax.drawing.view import Corner, View, box
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
@@ -42,7 +42,7 @@ def two_clouds(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"
     return _space([_cloud("source", source, SOURCE), _cloud("target", target, TARGET)])
 
 
-def overlap(view: View) -> "Figure":
+def overlap(drawn: DrawnPair) -> "Figure":
     """Both clouds as aligned, coloured by the probability of lying in the other one."""
     scale = [[i / (len(OVERLAP) - 1), colour] for i, colour in enumerate(OVERLAP)]
     shared = {"cmin": 0, "cmax": 1, "colorscale": scale}
@@ -51,27 +51,27 @@ def overlap(view: View) -> "Figure":
     bar = place | {"title": title, "thickness": 10, "outlinewidth": 0, "nticks": 3}
     return _space(
         [
-            _cloud("source", view.after, view.source_overlap, colorbar=bar, **shared),
-            _cloud("target", view.target, view.target_overlap, symbol="diamond", **shared),
+            _cloud("source", drawn.after, drawn.source_overlap, colorbar=bar, **shared),
+            _cloud("target", drawn.target, drawn.target_overlap, symbol="diamond", **shared),
         ]
     )
 
 
-def matches(view: View) -> "Figure":
+def matches(drawn: DrawnPair) -> "Figure":
     """The aligned source moved aside: lines of matches that agree with the pose are parallel."""
-    step = _sidestep(view)
-    ends = view.match + np.stack([step, np.zeros(3)])
+    step = _sidestep(drawn)
+    ends = drawn.match + np.stack([step, np.zeros(3)])
     return _space(
         [
-            _cloud("source", view.after + step, SOURCE, size=1.2),
-            _cloud("target", view.target, TARGET, size=1.2),
-            _lines("agrees with the pose", ends[view.agrees], GOOD),
-            _lines("does not", ends[~view.agrees], BAD),
+            _cloud("source", drawn.after + step, SOURCE, size=1.2),
+            _cloud("target", drawn.target, TARGET, size=1.2),
+            _lines("agrees with the pose", ends[drawn.agrees], GOOD),
+            _lines("does not", ends[~drawn.agrees], BAD),
         ]
     )
 
 
-def residuals(view: View, inlier_distance: float) -> "Figure":
+def residuals(drawn: DrawnPair, inlier_distance: float) -> "Figure":
     """How many source points lie how far from the target; the last bar holds all that is farther.
 
     Distances are in the clouds' unit.
@@ -79,7 +79,7 @@ def residuals(view: View, inlier_distance: float) -> "Figure":
     from plotly.graph_objects import Bar, Figure
 
     width = inlier_distance / BINS_WITHIN
-    bars = np.minimum(view.distance / width, BINS - 1).astype(int)
+    bars = np.minimum(drawn.distance / width, BINS - 1).astype(int)
     counts = np.bincount(bars, minlength=BINS)
     middles = (np.arange(BINS) + 0.5) * width
     inner, outer = slice(BINS_WITHIN), slice(BINS_WITHIN, None)
@@ -178,9 +178,9 @@ def _lines(name: str, ends: Float[np.ndarray, "k 2 3"], colour: str) -> Any:
     return Scatter3d(x=x, y=y, z=z, name=name, mode="lines", line=line, hoverinfo="skip")
 
 
-def _sidestep(view: View) -> Corner:
+def _sidestep(drawn: DrawnPair) -> Corner:
     """Far enough to the side or up, whichever is the shorter way, to see between the clouds."""
-    low, high = box(np.concatenate([view.after, view.target]))
+    low, high = box(np.concatenate([drawn.after, drawn.target]))
     sides = high - low
     step = np.zeros(3)
     axis = 0 if sides[0] < sides[2] else 2

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float
 
 from dbdnet_jax.alignment.align import Alignment
+from dbdnet_jax.drawing.selection import box, select_points
 from dbdnet_jax.drawing.style import BAD, GOOD, OVERLAP, SOURCE, TARGET
-from dbdnet_jax.drawing.view import box, look
 
 Points = Float[np.ndarray, "n 3"]
 OtherPoints = Float[np.ndarray, "m 3"]
@@ -27,17 +27,17 @@ def alignment_picture(
     from matplotlib.colors import LinearSegmentedColormap, to_rgba_array
     from matplotlib.figure import Figure
 
-    view = look(alignment, source, target)
+    drawn = select_points(alignment, source, target)
     figure = Figure(figsize=INCHES, dpi=DOTS, facecolor="white")
     canvas = FigureCanvasAgg(figure)
-    sides = len(view.after), len(view.target)
+    sides = len(drawn.after), len(drawn.target)
     sided = np.repeat(to_rgba_array([SOURCE, TARGET]), sides, axis=0)
     scale = LinearSegmentedColormap.from_list("overlap", OVERLAP)
-    likely = scale(np.concatenate([view.source_overlap, view.target_overlap]))
-    before = "before, each about its own middle" if view.apart else "before"
-    _panel(figure, 0, before, np.concatenate([view.before, view.target]), sided)
-    _panel(figure, 1, "after", np.concatenate([view.after, view.target]), sided)
-    _panel(figure, 2, "overlap", np.concatenate([view.after, view.target]), likely)
+    likely = scale(np.concatenate([drawn.source_overlap, drawn.target_overlap]))
+    before = "before, each about its own middle" if drawn.apart else "before"
+    _panel(figure, 0, before, np.concatenate([drawn.before, drawn.target]), sided)
+    _panel(figure, 1, "after", np.concatenate([drawn.after, drawn.target]), sided)
+    _panel(figure, 2, "overlap", np.concatenate([drawn.after, drawn.target]), likely)
     _words(figure, alignment, names)
     _keys(figure, scale)
     buffer = io.BytesIO()

@@ -228,7 +228,7 @@ def _joint_functions(config: RunConfig) -> tuple[LossFunction, Validation]:
     one = dataclasses.replace(model, iterations=1) if _from_anywhere(model) else model
 
     def turn(networks, pair, start, dropout_key=None):
-        """One look, and the registration of what it found: from the start, if there is one."""
+        """One pass, and the registration of what it found: from the start, if there is one."""
         params = Params(networks["overlap"], networks["registration"], one)
         *overlap, matched = predict_overlap_and_matches(
             params, pair.source, pair.target, dropout_key, start

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from dbdnet_jax.networks.dbdnet.matching import Matched
+from dbdnet_jax.networks.dbdnet.matching import SoftMatches
 from dbdnet_jax.ops.grouping import squared_distances
 from dbdnet_jax.ops.rigid import HIGHEST, apply
 from dbdnet_jax.ops.sampling import prefix_mask
@@ -154,7 +154,7 @@ def overlap_loss(
     target_probability: Float[Array, " m"],
     pair: Pair,
     gamma: float = 4.0,
-    matched: Matched | None = None,
+    matched: SoftMatches | None = None,
 ) -> tuple[Float[Array, ""], OverlapTerms]:
     """Focal loss of both clouds' overlap probabilities, each cloud counting half.
 

@@ -11,19 +11,19 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from dbdnet_jax.alignment.align import Alignment
-from dbdnet_jax.alignment.downsampling import DENSE, UNIT_SIZE, farthest_rows, thin
+from dbdnet_jax.alignment.downsampling import DENSE, UNIT_SIZE, downsample, farthest_rows
+from dbdnet_jax.alignment.normalised import is_full_resolution, normalise_pair
 from dbdnet_jax.alignment.quality import (
-    UNRELATED,
+    CHANCE_RATIO,
     Motion,
-    coincidence,
+    assess_pose,
     in_words,
     inlier_distance,
-    judge,
+    shared_point_score,
 )
-from dbdnet_jax.alignment.scene import build_scene, is_whole
 from dbdnet_jax.alignment.success import (
     Coefficients,
-    Evidence,
+    PoseFeatures,
     load_coefficients,
     success_probability,
 )
@@ -84,10 +84,10 @@ def test_the_timings_add_up_and_nothing_else_is_random(plain):
     assert set(plain.timings) == {
         "read",
         "weights",
-        "thin",
+        "downsample",
         "network",
         "refine",
-        "judge",
+        "quality",
         "overlap",
     }
 
@@ -153,7 +153,7 @@ def test_the_threshold_becomes_the_networks(monkeypatch):
         seen.append(params.config.overlap_threshold)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("dbdnet_jax.alignment.search.ask_network", ask)
+    monkeypatch.setattr("dbdnet_jax.alignment.search.predict_pose", ask)
     with pytest.raises(KeyboardInterrupt):
         tiny_align(SOURCE, TARGET, overlap_threshold=0.25)
     assert seen == [0.25]
@@ -162,13 +162,13 @@ def test_the_threshold_becomes_the_networks(monkeypatch):
 def test_thinning_keeps_shape_and_forgets_density_and_strays():
     points = solid(200_000, 5)
     points[0] = 1e6
-    chosen = thin(points, 300)
+    chosen = downsample(points, 300)
     assert 300 < len(chosen.dense) <= DENSE
-    assert chosen.strays == 1 and len(chosen.sparse) == 300
+    assert chosen.outliers == 1 and len(chosen.sparse) == 300
     assert 0 not in chosen.dense and set(chosen.sparse) <= set(chosen.dense)
     assert cKDTree(points[chosen.dense]).query(points[1:])[0].max() < 0.05
     order = np.random.default_rng(0).permutation(len(points))
-    again = thin(points[order], 300)
+    again = downsample(points[order], 300)
     np.testing.assert_array_equal(points[order][again.sparse], points[chosen.sparse])
 
 
@@ -181,10 +181,10 @@ def test_farthest_rows_are_greedy_and_skip_copies():
 
 
 def test_auto_scale_brings_the_larger_cloud_to_the_weights_size():
-    scene = build_scene(40 * SOURCE, 40 * TARGET, "auto", 150, np.eye(4))
+    scene = normalise_pair(40 * SOURCE, 40 * TARGET, "auto", 150, np.eye(4))
     norms = [np.linalg.norm(side.sparse, axis=1) for side in (scene.source, scene.target)]
     assert max(np.quantile(x, 0.98) for x in norms) == pytest.approx(UNIT_SIZE)
-    assert build_scene(SOURCE, TARGET, 2.5, 150, np.eye(4)).factor == 2.5
+    assert normalise_pair(SOURCE, TARGET, 2.5, 150, np.eye(4)).factor == 2.5
 
 
 def plane(count: int, seed: int) -> np.ndarray:
@@ -211,10 +211,10 @@ def sphere(count: int, seed: int) -> np.ndarray:
         (solid, ""),
     ],
 )
-def test_free_motions_are_named(surface, words):
+def test_degenerate_motions_are_named(surface, words):
     clouds = surface(3000, 1), surface(3000, 2)
-    judgement = judge(*clouds, inlier_distance(*clouds))
-    assert in_words(tuple(_snap(motion) for motion in judgement.free)) == words
+    quality = assess_pose(*clouds, inlier_distance(*clouds))
+    assert in_words(tuple(_snap(motion) for motion in quality.degenerate_motions)) == words
 
 
 def _snap(motion: Motion) -> Motion:
@@ -225,11 +225,11 @@ def _snap(motion: Motion) -> Motion:
 
 def test_information_is_the_curvature_of_the_plane_residuals():
     clouds = solid(2000, 1), solid(2000, 2)
-    judgement = judge(*clouds, inlier_distance(*clouds))
-    assert np.all(np.linalg.eigvalsh(judgement.information) > 0)
+    quality = assess_pose(*clouds, inlier_distance(*clouds))
+    assert np.all(np.linalg.eigvalsh(quality.information) > 0)
     # 2000 points that are off by plane_rmse fix a translation to about this, in each direction.
-    sigma = np.sqrt(np.diag(np.linalg.inv(judgement.information))[3:])
-    assert np.all(sigma < 10 * judgement.plane_rmse / np.sqrt(2000))
+    sigma = np.sqrt(np.diag(np.linalg.inv(quality.information))[3:])
+    assert np.all(sigma < 10 * quality.plane_rmse / np.sqrt(2000))
 
 
 @pytest.mark.parametrize("even", [False, True])
@@ -242,9 +242,9 @@ def test_points_coincide_where_clouds_share_them_in_the_right_pose_only(even):
     noisy = points + random_cloud(3, len(points)) * 0.2 * spacing
 
     def between(source, target):
-        return coincidence(source, target, inlier_distance(source, target))
+        return shared_point_score(source, target, inlier_distance(source, target))
 
-    assert between(points, points) == UNRELATED
+    assert between(points, points) == CHANCE_RATIO
     assert between(noisy, points) > 0.3
     assert between(points @ turn.T, points) < 0.02 and between(others, points) < 0.02
     assert between(points + 9.0, points) == 0.0
@@ -252,11 +252,11 @@ def test_points_coincide_where_clouds_share_them_in_the_right_pose_only(even):
 
 def test_clouds_that_a_grid_has_thinned_are_not_asked_whether_points_coincide():
     few, many = (
-        build_scene(c, c, "auto", 100, np.eye(4)) for c in (solid(500, 1), solid(11_000, 1))
+        normalise_pair(c, c, "auto", 100, np.eye(4)) for c in (solid(500, 1), solid(11_000, 1))
     )
-    assert is_whole(few) and not is_whole(many)
+    assert is_full_resolution(few) and not is_full_resolution(many)
     stray = np.vstack([solid(500, 1), [[50.0, 0, 0]]])
-    assert is_whole(build_scene(stray, stray, "auto", 100, np.eye(4)))
+    assert is_full_resolution(normalise_pair(stray, stray, "auto", 100, np.eye(4)))
 
 
 def test_a_symmetric_shape_is_refused_and_its_motion_named():
@@ -274,11 +274,11 @@ def test_clouds_of_different_units_are_refused():
 
 
 def test_a_probability_is_a_logistic_of_standardised_evidence():
-    def evidence(value: float) -> Evidence:
-        return Evidence(*[value] * len(Evidence._fields))
+    def evidence(value: float) -> PoseFeatures:
+        return PoseFeatures(*[value] * len(PoseFeatures._fields))
 
     fitted = Coefficients(evidence(1), evidence(2), evidence(0.5), -1.0)
-    terms = len(Evidence._fields) * 0.5 * (3 - 1) / 2
+    terms = len(PoseFeatures._fields) * 0.5 * (3 - 1) / 2
     assert success_probability(evidence(3), fitted) == pytest.approx(1 / (1 + np.exp(1 - terms)))
     assert 0 < success_probability(evidence(-1e9), fitted) < LIKELY
     assert load_coefficients().bias == load_coefficients().bias  # the shipped file is whole

@@ -12,7 +12,7 @@ from dbdnet_jax.alignment import pose_graph, search
 from dbdnet_jax.alignment import validity as verdict
 from dbdnet_jax.alignment.align import Alignment, Matches
 from dbdnet_jax.alignment.align_many import align_many
-from dbdnet_jax.alignment.success import Evidence
+from dbdnet_jax.alignment.success import PoseFeatures
 from tests.aligning import POINTS, motion, rotation_error_deg, solid, tiny_params
 from tests.conftest import random_cloud
 
@@ -51,7 +51,7 @@ def aligned(transform, probability=0.9, reason="", seed=0) -> Alignment:
         matches=Matches(rows, rows, np.zeros(0)),
         information=jacobian.T @ jacobian / 0.01**2,
         pivot=pivot,
-        evidence=Evidence(*[0.0] * len(Evidence._fields)),
+        evidence=PoseFeatures(*[0.0] * len(PoseFeatures._fields)),
         timings={},
     )
 
@@ -197,16 +197,16 @@ def test_nothing_joined_leaves_the_reference_alone(stand_in):
     assert found.connected.tolist() == [True, False]
 
 
-def clueless(params, source, target) -> search.Proposal:
+def clueless(params, source, target) -> search.NetworkPose:
     """A network that knows nothing, and costs no compilation."""
     ones = np.ones(len(source)), np.ones(len(target))
-    return search.Proposal(
+    return search.NetworkPose(
         np.eye(4), *ones, ones[0] > 0, np.outer(*ones) / len(target), ones[0], True
     )
 
 
 def test_three_scans_of_a_shape_find_together(monkeypatch):
-    monkeypatch.setattr(search, "ask_network", clueless)
+    monkeypatch.setattr(search, "predict_pose", clueless)
     monkeypatch.setattr(verdict, "LIKELY", 0.0)
     true = poses(3, 30.0)
     clouds = [search.move(np.linalg.inv(pose), solid(190, i)) for i, pose in enumerate(true)]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dbdnet_jax import save_params
-from dbdnet_jax.alignment.search import ask_network
+from dbdnet_jax.alignment.search import predict_pose
 from dbdnet_jax.alignment.writing import write_ply
 from dbdnet_jax.cli import UNUSABLE, main
 from tests.aligning import POINTS, pair, rotation_error_deg, solid, tiny_align, tiny_params
@@ -162,7 +162,7 @@ def test_a_stray_point_changes_little():
 def test_the_network_itself_answers_nonsense_with_valid_false_or_a_rotation(bad):
     source = solid(POINTS, 1)
     source[3] = bad
-    answer = ask_network(tiny_params(), source, solid(POINTS, 2))
+    answer = predict_pose(tiny_params(), source, solid(POINTS, 2))
     assert np.isfinite(answer.transform).all()
     assert not answer.valid or abs(np.linalg.det(answer.transform[:3, :3]) - 1) < 1e-6
 

@@ -17,17 +17,17 @@ def table(count: int, seed: int) -> np.ndarray:
 
 
 def test_a_square_table_has_rivals_a_quarter_and_half_a_turn_away():
-    rival = search.best_rival(np.eye(4), table(360, 0), table(360, 1))
-    assert abs(rival.margin) < 0.1
-    assert rival.angle_deg == pytest.approx(round(rival.angle_deg / 90) * 90, abs=3)
-    assert abs(rival.axis[2]) > 0.99
-    assert rival.crowd > 1.5
+    alternative = search.strongest_alternative(np.eye(4), table(360, 0), table(360, 1))
+    assert abs(alternative.margin) < 0.1
+    assert alternative.angle_deg == pytest.approx(round(alternative.angle_deg / 90) * 90, abs=3)
+    assert abs(alternative.axis[2]) > 0.99
+    assert alternative.alternatives > 1.5
 
 
 def test_a_shape_without_symmetry_has_none_that_fits_as_well():
-    rival = search.best_rival(np.eye(4), solid(380, 0), solid(380, 1))
-    assert rival.margin > 0.4
-    assert rival.crowd < 3
+    alternative = search.strongest_alternative(np.eye(4), solid(380, 0), solid(380, 1))
+    assert alternative.margin > 0.4
+    assert alternative.alternatives < 3
 
 
 def test_what_refining_would_make_of_a_pose_is_no_rival_of_it():
@@ -36,20 +36,20 @@ def test_what_refining_would_make_of_a_pose_is_no_rival_of_it():
     rough[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
     source, target = solid(380, 0), solid(380, 1)
     assert search.angle_between(search.refine(rough, source, target), np.eye(4))[0] < 3
-    rival = search.best_rival(rough, source, target)
+    alternative = search.strongest_alternative(rough, source, target)
     assert search.angle_between(np.eye(4), rough)[0] > 15
-    assert rival.margin > -0.1
+    assert alternative.margin > -0.1
 
 
 @pytest.mark.parametrize(("count", "scale"), [(60, 1.0), (60, 3.0), (380, 3.0)])
 def test_the_true_pose_fits_far_better_in_sparse_and_in_large_clouds_too(count, scale):
     source, target = scale * solid(count, 0), scale * solid(count, 1)
-    own = search.misfit(np.eye(4), source, target)
+    own = search.truncated_rmse(np.eye(4), source, target)
     rng = np.random.default_rng(0)
     for _ in range(20):
         turned = search.as_transform(rng.normal(size=(3, 3)), scale * rng.normal(size=3) * 0.1)
         if search.angle_between(turned, np.eye(4))[0] > 30:
-            assert search.misfit(turned, source, target) > 1.25 * own
+            assert search.truncated_rmse(turned, source, target) > 1.25 * own
 
 
 @pytest.mark.parametrize("count", [300, 1100, 5000])

@@ -164,10 +164,10 @@ def test_explore_leaves_a_local_minimum_and_trusts_the_first(crops, monkeypatch)
 def test_large_clouds_are_thinned_evenly(points):
     limit = module.MOST_POINTS
     dense = np.tile(points, (10, 1))
-    thin = module._thin(cloud(dense, 4096))
-    assert thin.points.shape == (limit, 3) and thin.count == limit
+    fewer = module._thin(cloud(dense, 4096))
+    assert fewer.points.shape == (limit, 3) and fewer.count == limit
     rows = np.arange(limit) * len(dense) // limit
-    assert_close(thin.points, np.float32(dense[rows]), EXACT)
+    assert_close(fewer.points, np.float32(dense[rows]), EXACT)
     few = module._thin(cloud(points, 4096))
     assert few.count == SIZE
     assert_close(few.points[:SIZE], np.float32(points), EXACT)

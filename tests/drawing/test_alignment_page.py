@@ -18,7 +18,7 @@ from dbdnet_jax.alignment.align import Matches  # noqa: E402
 from dbdnet_jax.drawing import style  # noqa: E402
 from dbdnet_jax.drawing.alignment_page import alignment_page  # noqa: E402
 from dbdnet_jax.drawing.picture import alignment_picture  # noqa: E402
-from dbdnet_jax.drawing.view import MATCHES_DRAWN, look  # noqa: E402
+from dbdnet_jax.drawing.selection import MATCHES_DRAWN, select_points  # noqa: E402
 from dbdnet_jax.errors import MissingExtraError, require_drawing  # noqa: E402
 from tests.drawn import HOSTILE, SOURCE, TARGET, TRUE, Reader, by_hand  # noqa: E402
 
@@ -94,29 +94,29 @@ def test_a_picture_has_its_size_and_both_clouds():
 
 
 def test_distances_and_agreement_are_those_of_the_pose():
-    view = look(by_hand(), SOURCE, TARGET)
+    drawn = select_points(by_hand(), SOURCE, TARGET)
     moved = SOURCE @ TRUE[:3, :3].T + TRUE[:3, 3]
     distances = np.linalg.norm(moved[:, None] - TARGET, axis=2).min(axis=1)
-    np.testing.assert_allclose(view.distance, distances, atol=1e-12)
-    np.testing.assert_array_equal(view.agrees, distances[:MATCHES_DRAWN] <= 0.1)
-    np.testing.assert_allclose(view.target + view.origin, TARGET, atol=1e-12)
-    np.testing.assert_allclose(view.before + view.origin, SOURCE, atol=1e-12)
-    assert not view.apart
+    np.testing.assert_allclose(drawn.distance, distances, atol=1e-12)
+    np.testing.assert_array_equal(drawn.agrees, distances[:MATCHES_DRAWN] <= 0.1)
+    np.testing.assert_allclose(drawn.target + drawn.origin, TARGET, atol=1e-12)
+    np.testing.assert_allclose(drawn.before + drawn.origin, SOURCE, atol=1e-12)
+    assert not drawn.apart
 
 
 def test_clouds_far_apart_are_drawn_about_their_own_middles():
     far = TRUE.copy()
     far[:3, 3] += 1e6
-    view = look(by_hand(transform=far), SOURCE, TARGET + 1e6)
-    assert view.apart and max(np.abs(view.before).max(), np.abs(view.target).max()) < 2
-    assert view.distance.max() < 0.3
+    drawn = select_points(by_hand(transform=far), SOURCE, TARGET + 1e6)
+    assert drawn.apart and max(np.abs(drawn.before).max(), np.abs(drawn.target).max()) < 2
+    assert drawn.distance.max() < 0.3
 
 
 def test_a_large_cloud_is_thinned_and_the_page_says_so():
     rng = np.random.default_rng(0)
     many = np.concatenate([SOURCE + rng.normal(0, 0.02, SOURCE.shape) for _ in range(50)])
     alignment = by_hand(source_overlap=np.zeros(len(many)))
-    drawn = len(look(alignment, many, TARGET).after)
+    drawn = len(select_points(alignment, many, TARGET).after)
     assert 2000 < drawn <= 10_000
     text = Reader(alignment_page(alignment, many, TARGET)).text
     assert f"19,000{drawn:,}" in text and "an even choice of a large one" in text

@@ -74,7 +74,7 @@ def test_fifty_sizes_are_traced_as_often_as_there_are_buckets(monkeypatch):
     monkeypatch.setattr(search, "load_or_trace", lambda function, *rest: jax.jit(function))
     for n, m in np.random.default_rng(0).integers(16, max(BUCKETS) + 1, (50, 2)):
         source, target = random_cloud(n, n), random_cloud(m, m)
-        proposal = search.ask_network(tiny_params(), source, target)
+        proposal = search.predict_pose(tiny_params(), source, target)
         assert proposal.mass.shape == (n, m)
         assert proposal.source_kept.all() and proposal.target_overlap.all()
         search.refine(proposal.transform, source, target)

@@ -26,7 +26,7 @@ class ModelConfig:
     parameter_width: int = 1024  # of the parameter network's global feature
     neighbours: int = 20  # k of every neighbour search
     neighbour_space: str = "feature"  # or "coordinates": one search per level, shared
-    overlap_passes: int = 1  # more: looks again at the clouds as the last one's answer aligns them
+    overlap_passes: int = 1  # more: again over the clouds as the last one's answer aligns them
     overlap_points: int = 0  # that the overlap network sees, farthest first; 0: all
     registration_points: int = 0  # of the selected ones, that are matched; 0: all
     overlap_threshold: float = 0.5

@@ -11,7 +11,7 @@ from dbdnet_jax.ops.sampling import farthest_order, inverse_order, prefix_mask, 
 from dbdnet_jax.types import Cloud, Rigid
 
 
-def grow(x: jax.Array, size: int) -> jax.Array:
+def pad_rows(x: jax.Array, size: int) -> jax.Array:
     """Pad the rows of ``x`` with zeros to ``size``."""
     return jnp.pad(x, [(0, size - x.shape[0])] + [(0, 0)] * (x.ndim - 1))
 
@@ -19,7 +19,7 @@ def grow(x: jax.Array, size: int) -> jax.Array:
 def stack_clouds(source: Cloud, target: Cloud) -> Cloud:
     """Two clouds of any static sizes as one stack; padding, as everywhere, changes nothing."""
     size = max(source.points.shape[0], target.points.shape[0])
-    points = jnp.stack([grow(source.points, size), grow(target.points, size)])
+    points = jnp.stack([pad_rows(source.points, size), pad_rows(target.points, size)])
     points = points.astype(jnp.promote_types(points.dtype, jnp.float32))
     return Cloud(points, jnp.stack([jnp.asarray(source.count), jnp.asarray(target.count)]))
 
@@ -28,7 +28,7 @@ def stack_masked(src, tgt, src_mask, tgt_mask) -> tuple[Cloud, Int[Array, "2 n"]
     """Stack two clouds with masks; ``order[c, row]`` is the caller's row of a stacked row."""
     size = max(src.shape[0], tgt.shape[0])
     masks = [
-        grow(jnp.ones(x.shape[0], bool) if mask is None else mask, size)
+        pad_rows(jnp.ones(x.shape[0], bool) if mask is None else mask, size)
         for x, mask in ((src, src_mask), (tgt, tgt_mask))
     ]
     keep = jnp.stack(masks)
@@ -38,7 +38,7 @@ def stack_masked(src, tgt, src_mask, tgt_mask) -> tuple[Cloud, Int[Array, "2 n"]
     return Cloud(points, jnp.sum(keep, axis=1)), order
 
 
-def prepare(clouds: Cloud, config: ModelConfig, limit: int):
+def centre_and_order(clouds: Cloud, config: ModelConfig, limit: int):
     """Centre both clouds and bring them into farthest-point order.
 
     ``limit`` rows are sampled; half of the points where it is 0.
@@ -60,7 +60,7 @@ def prepare(clouds: Cloud, config: ModelConfig, limit: int):
     return ordered, order, skip_rows, centroid
 
 
-def first_rows(clouds: Cloud, limit: int) -> Cloud:
+def truncate_rows(clouds: Cloud, limit: int) -> Cloud:
     """The first ``limit`` rows of both clouds; all of them where it is 0."""
     if not limit:
         return clouds

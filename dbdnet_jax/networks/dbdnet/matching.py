@@ -1,4 +1,4 @@
-"""The overlap network's own look at the other cloud: soft matches, and what follows from them.
+"""The overlap network's own soft matches of both clouds, and what follows from them.
 
 Not in the paper, whose overlap head knows of the other cloud only what cross-attention and a
 maximum over it bring (`ModelConfig.overlap_matching` is False there). A point that has no
@@ -24,7 +24,7 @@ FIT_FEATURES = 1 + 2 * len(WIDTHS)
 FAR = 1e3  # stands for the distance to a point that is not there
 
 
-class Matched(NamedTuple):
+class SoftMatches(NamedTuple):
     """Soft matches of two clouds, and the motion that they ask for.
 
     ``log_matrix[i, j]`` is the logarithm of the mass that source point i gives to target point j,
@@ -36,13 +36,13 @@ class Matched(NamedTuple):
     motion: Rigid
 
 
-class Matching(nn.Module):
+class MatchingLayer(nn.Module):
     """Two numbers, how feature distances become affinities: ``-softplus(beta) (d^2 - alpha)``."""
 
     iterations: int
 
     @nn.compact
-    def __call__(self, clouds: Cloud, features: Float[Array, "2 n d"]) -> Matched:
+    def __call__(self, clouds: Cloud, features: Float[Array, "2 n d"]) -> SoftMatches:
         """Match two stacked clouds by their features and solve for the motion."""
         beta = self.param("beta", nn.initializers.zeros, ()).astype(features.dtype)
         alpha = self.param("alpha", nn.initializers.zeros, ()).astype(features.dtype)
@@ -52,7 +52,7 @@ class Matching(nn.Module):
         log_matrix = sinkhorn(affinity, rows, columns, self.iterations)
         soft, mass = soft_targets(jnp.exp(log_matrix), clouds.points[1])
         motion, _ = rigid.procrustes(clouds.points[0], soft, mass)
-        return Matched(clouds, log_matrix, motion)
+        return SoftMatches(clouds, log_matrix, motion)
 
 
 def soft_targets(
@@ -64,7 +64,7 @@ def soft_targets(
     return soft / jnp.where(mass > 1e-12, mass, 1.0)[:, None], mass
 
 
-def fit_features(matched: Matched) -> Float[Array, "2 n f"]:
+def match_features(matched: SoftMatches) -> Float[Array, "2 n f"]:
     """How well each point of both clouds fits in the other one.
 
     Its mass; then, through bells of several widths, its distance to the nearest point of the

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from dbdnet_jax.networks.blocks import Affine, AttentionBlock, DenseNorm, dense, over_clouds
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.dbdnet.encoder import Encoder
-from dbdnet_jax.networks.dbdnet.matching import Matched, Matching, fit_features
+from dbdnet_jax.networks.dbdnet.matching import MatchingLayer, SoftMatches, match_features
 from dbdnet_jax.ops.attention import position_code
 from dbdnet_jax.ops.grouping import masked_max
 from dbdnet_jax.ops.pyramid import Pyramid
@@ -24,7 +24,7 @@ class OverlapNetwork(nn.Module):
     @nn.compact
     def __call__(
         self, clouds: Cloud, pyramids: Pyramid, dropout_key: PRNGKeyArray | None = None
-    ) -> tuple[Float[Array, "2 n"], Matched | None]:
+    ) -> tuple[Float[Array, "2 n"], SoftMatches | None]:
         """Logits of the points of two clouds, stacked, each in farthest-point order.
 
         The pyramids may be of the clouds before a motion. With ``overlap_matching`` also the soft
@@ -47,8 +47,8 @@ class OverlapNetwork(nn.Module):
         other = jnp.broadcast_to(pooled[:, None, :], features.shape)
         seen, matched = [features, other], None
         if config.overlap_matching:
-            matched = Matching(config.sinkhorn_iterations, name="matching")(clouds, features)
-            seen.append(fit_features(matched))
+            matched = MatchingLayer(config.sinkhorn_iterations, name="matching")(clouds, features)
+            seen.append(match_features(matched))
         features = jnp.concatenate(seen, axis=-1)
         for layer, (size, groups) in enumerate(config.head_layers):
             decode = DenseNorm(size, groups, name=f"decoder_{layer}")

@@ -1,4 +1,4 @@
-"""How the overlap network looks at two clouds: at some of their points, the source moved."""
+"""One pass of the overlap network over two clouds: over some of their points, the source moved."""
 
 from typing import Any, NamedTuple
 
@@ -7,8 +7,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
-from dbdnet_jax.networks.dbdnet.frames import first_rows, move_source, prepare, uncentred
-from dbdnet_jax.networks.dbdnet.matching import Matched
+from dbdnet_jax.networks.dbdnet.frames import (
+    centre_and_order,
+    move_source,
+    truncate_rows,
+    uncentred,
+)
+from dbdnet_jax.networks.dbdnet.matching import SoftMatches
 from dbdnet_jax.networks.dbdnet.overlap import OverlapNetwork
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.ops import rigid
@@ -18,8 +23,8 @@ from dbdnet_jax.ops.sampling import inverse_order, prefix_mask
 from dbdnet_jax.types import Cloud, Rigid
 
 
-class View(NamedTuple):
-    """What all looks of the overlap network at two clouds share."""
+class PreparedPair(NamedTuple):
+    """What all passes of the overlap network over two clouds share."""
 
     seen: Cloud  # stacked and centred, in farthest-point order, the points that the network sees
     centroid: Float[Array, "2 3"]
@@ -29,41 +34,41 @@ class View(NamedTuple):
     nearest: tuple[Array, Array] | None  # of all points among the seen ones, to interpolate
 
 
-def view_of(config: ModelConfig, clouds: Cloud) -> View:
-    """Prepare two stacked clouds for any number of looks."""
-    ordered, order, skip_rows, centroid = prepare(clouds, config, config.overlap_points)
-    seen = first_rows(ordered, config.overlap_points)
+def prepare_pair(config: ModelConfig, clouds: Cloud) -> PreparedPair:
+    """Prepare two stacked clouds for any number of passes."""
+    ordered, order, skip_rows, centroid = centre_and_order(clouds, config, config.overlap_points)
+    seen = truncate_rows(ordered, config.overlap_points)
     pyramids = build_pyramids(seen, config.neighbours, skip_rows)
     nearest = None
     if seen.points.shape[1] < ordered.points.shape[1]:
         nearest = jax.vmap(interpolation_weights)(ordered.points, seen.points, seen.count)
-    return View(seen, centroid, pyramids, order, ordered, nearest)
+    return PreparedPair(seen, centroid, pyramids, order, ordered, nearest)
 
 
-def look(
-    params: Params, view: View, start: Rigid, dropout_key: PRNGKeyArray | None = None
-) -> tuple[Float[Array, "2 n"], Matched | None]:
+def apply_overlap_network(
+    params: Params, prepared: PreparedPair, start: Rigid, dropout_key: PRNGKeyArray | None = None
+) -> tuple[Float[Array, "2 n"], SoftMatches | None]:
     """Logits of the points seen, and their matches in the clouds' own frames.
 
     ``start`` has moved the source; it is a motion between the centred clouds.
     """
     network = OverlapNetwork(params.config)
-    moved = move_source(view.seen, start)
+    moved = move_source(prepared.seen, start)
     variables = {"params": params.overlap}
-    answer: Any = network.apply(variables, moved, view.pyramids, dropout_key)
+    answer: Any = network.apply(variables, moved, prepared.pyramids, dropout_key)
     logits, matched = answer
     if matched is not None:
-        own = view.seen._replace(points=view.seen.points + view.centroid[:, None, :])
-        motion = uncentred(rigid.compose(matched.motion, start), view.centroid)
+        own = prepared.seen._replace(points=prepared.seen.points + prepared.centroid[:, None, :])
+        motion = uncentred(rigid.compose(matched.motion, start), prepared.centroid)
         matched = matched._replace(clouds=own, motion=motion)
     return logits, matched
 
 
-def probability_of_all(view: View, logits: Float[Array, "2 n"]) -> Float[Array, "2 m"]:
+def probability_of_all(prepared: PreparedPair, logits: Float[Array, "2 n"]) -> Float[Array, "2 m"]:
     """Overlap probability of all points, in the clouds' own row order; zero in the padding."""
-    size = view.ordered.points.shape[1]
-    if view.nearest is not None:
-        logits = jax.vmap(interpolate)(logits[..., None], *view.nearest)[..., 0]
-    valid = jax.vmap(lambda count: prefix_mask(size, count))(view.ordered.count)
-    logits = jnp.take_along_axis(logits, jax.vmap(inverse_order)(view.order), axis=1)
+    size = prepared.ordered.points.shape[1]
+    if prepared.nearest is not None:
+        logits = jax.vmap(interpolate)(logits[..., None], *prepared.nearest)[..., 0]
+    valid = jax.vmap(lambda count: prefix_mask(size, count))(prepared.ordered.count)
+    logits = jnp.take_along_axis(logits, jax.vmap(inverse_order)(prepared.order), axis=1)
     return jnp.where(valid, jax.nn.sigmoid(logits), 0.0)

@@ -6,17 +6,21 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.dbdnet.frames import (
+    centre_and_order,
     centred,
-    first_rows,
-    grow,
     move_source,
-    prepare,
+    pad_rows,
     stack_clouds,
     stack_masked,
+    truncate_rows,
     uncentred,
 )
-from dbdnet_jax.networks.dbdnet.matching import Matched, soft_targets
-from dbdnet_jax.networks.dbdnet.overlap_pass import look, probability_of_all, view_of
+from dbdnet_jax.networks.dbdnet.matching import SoftMatches, soft_targets
+from dbdnet_jax.networks.dbdnet.overlap_pass import (
+    apply_overlap_network,
+    prepare_pair,
+    probability_of_all,
+)
 from dbdnet_jax.networks.dbdnet.registration import RegistrationNetwork
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.ops import rigid
@@ -49,26 +53,26 @@ def register(
         )
     clouds, order = stack_masked(src, tgt, src_mask, tgt_mask)
     sizes = src.shape[0], tgt.shape[0]
-    view = view_of(params.config, clouds)
+    prepared = prepare_pair(params.config, clouds)
     start = rigid.identity(clouds.points.dtype)
     if params.config.overlap_passes == 1:
-        logits, _ = look(params, view, start)
-        return _register(params, clouds, order, probability_of_all(view, logits), sizes)
+        logits, _ = apply_overlap_network(params, prepared, start)
+        return _register(params, clouds, order, probability_of_all(prepared, logits), sizes)
 
-    level = clouds._replace(points=clouds.points - view.centroid[:, None, :])
+    level = clouds._replace(points=clouds.points - prepared.centroid[:, None, :])
 
-    def look_and_register(motion, _):
-        logits, _ = look(params, view, motion)
+    def pass_and_register(motion, _):
+        logits, _ = apply_overlap_network(params, prepared, motion)
         moved = move_source(level, motion)
-        answer = _register(params, moved, order, probability_of_all(view, logits), sizes)
+        answer = _register(params, moved, order, probability_of_all(prepared, logits), sizes)
         motion = rigid.compose(Rigid(answer.rotation, answer.translation), motion)
         return motion, (motion, answer)
 
-    _, answers = jax.lax.scan(look_and_register, start, length=params.config.overlap_passes)
+    _, answers = jax.lax.scan(pass_and_register, start, length=params.config.overlap_passes)
     motion, answer = jax.tree.map(lambda leaf: leaf[-1], answers)
-    motion = _identity_unless(answer.valid, uncentred(motion, view.centroid))
+    motion = _identity_unless(answer.valid, uncentred(motion, prepared.centroid))
     branches = (
-        branch._replace(target=branch.target + view.centroid[None, 1])
+        branch._replace(target=branch.target + prepared.centroid[None, 1])
         for branch in (answer.rotation_branch, answer.translation_branch)
     )
     rotation_branch, translation_branch = branches
@@ -105,26 +109,26 @@ def predict_overlap_and_matches(
     target: Cloud,
     dropout_key: PRNGKeyArray | None = None,
     start: Rigid | None = None,
-) -> tuple[Float[Array, " n"], Float[Array, " m"], Matched | None]:
+) -> tuple[Float[Array, " n"], Float[Array, " m"], SoftMatches | None]:
     """`predict_overlap`, and the soft matches of a network that has them (else None).
 
     With a ``start``, a first idea of the motion, one pass from there. Otherwise
     `ModelConfig.overlap_passes` from the clouds with their centroids aligned, each from the motion
     that the matches of the one before ask for.
     """
-    view = view_of(params.config, stack_clouds(source, target))
+    prepared = prepare_pair(params.config, stack_clouds(source, target))
 
     def one_pass(motion, _):
-        logits, matched = look(params, view, motion, dropout_key)
-        after = motion if matched is None else centred(matched.motion, view.centroid)
+        logits, matched = apply_overlap_network(params, prepared, motion, dropout_key)
+        after = motion if matched is None else centred(matched.motion, prepared.centroid)
         return after, (logits, matched)
 
     passes = params.config.overlap_passes if start is None else 1
-    still = rigid.identity(view.seen.points.dtype)
-    start = still if start is None else centred(start, view.centroid)
+    still = rigid.identity(prepared.seen.points.dtype)
+    start = still if start is None else centred(start, prepared.centroid)
     _, answers = jax.lax.scan(one_pass, start, length=passes)
     logits, matched = jax.tree.map(lambda leaf: leaf[-1], answers)
-    probability = probability_of_all(view, logits)
+    probability = probability_of_all(prepared, logits)
     sizes = source.points.shape[0], target.points.shape[0]
     return probability[0, : sizes[0]], probability[1, : sizes[1]], matched
 
@@ -145,7 +149,7 @@ def register_given_overlap(
     sizes = (source.points.shape[0], target.points.shape[0])
     size = clouds.points.shape[1]
     order = jnp.broadcast_to(jnp.arange(size), (2, size))
-    probability = jnp.stack([grow(source_overlap, size), grow(target_overlap, size)])
+    probability = jnp.stack([pad_rows(source_overlap, size), pad_rows(target_overlap, size)])
     return _register(params, clouds, order, probability, sizes, dropout_key)
 
 
@@ -220,13 +224,15 @@ def _iterate(params: Params, kept: Cloud, dropout_key):
     unmoved = None
     if config.released:
         # Departure: features of the unmoved source serve all iterations.
-        ordered, _, skip_rows, _ = prepare(kept, config, 0)
+        ordered, _, skip_rows, _ = centre_and_order(kept, config, 0)
         unmoved = network.apply(variables, ordered, skip_rows, method="encode")
 
     def iterate(motion, key):
         moved = move_source(kept, motion)
-        ordered, order, skip_rows, centroid = prepare(moved, config, config.registration_points)
-        ordered, features = first_rows(ordered, config.registration_points), unmoved
+        ordered, order, skip_rows, centroid = centre_and_order(
+            moved, config, config.registration_points
+        )
+        ordered, features = truncate_rows(ordered, config.registration_points), unmoved
         if features is None:
             features = network.apply(variables, ordered, skip_rows, method="encode")
         matrix = jnp.asarray(network.apply(variables, ordered, features, key, method="match"))

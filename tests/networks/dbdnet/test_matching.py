@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dbdnet_jax.networks.dbdnet.matching import WIDTHS, Matched, Matching, fit_features
+from dbdnet_jax.networks.dbdnet.matching import WIDTHS, MatchingLayer, SoftMatches, match_features
 from dbdnet_jax.networks.dbdnet.register import predict_overlap_and_matches
 from dbdnet_jax.types import Cloud, Rigid
 from tests import oracle
@@ -25,7 +25,7 @@ def test_matches_are_sinkhorns_and_the_motion_that_of_procrustes(x64):
     clouds = stacked_clouds()
     features = random_cloud(1, 2 * N, WIDTH).reshape(2, N, WIDTH)
     parameters = {"alpha": jnp.asarray(2.0), "beta": jnp.asarray(-0.3)}
-    matching = Matching(4).apply({"params": parameters}, clouds, jnp.asarray(features))
+    matching = MatchingLayer(4).apply({"params": parameters}, clouds, jnp.asarray(features))
     affinity = [
         [-np.log1p(np.exp(-0.3)) * (oracle.squared_distance(a, b) - 2.0) for b in features[1]]
         for a in features[0]
@@ -45,7 +45,7 @@ def test_how_well_a_point_fits_is_its_mass_and_two_distances_after_the_motion(x6
     rotation = oracle.rotation_from_euler(np.array([0.3, -0.2, 0.5]))
     motion = Rigid(jnp.asarray(rotation), jnp.asarray([0.1, 0.2, -0.1]))
     log_matrix = jnp.log(jnp.asarray(np.where(matrix > 0, matrix, 1e-300)))
-    found = fit_features(Matched(clouds, log_matrix, motion))
+    found = match_features(SoftMatches(clouds, log_matrix, motion))
     source = np.asarray(clouds.points[0]) @ rotation.T + np.asarray(motion.translation)
     target = np.asarray(clouds.points[1])
     for cloud, (own, other, mass) in enumerate(

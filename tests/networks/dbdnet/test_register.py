@@ -115,9 +115,9 @@ def test_several_passes_are_both_networks_in_turn(x64):
     params = small_params(5, config)
     source, target = (Cloud(jnp.asarray(x), jnp.asarray(len(x))) for x in (SOURCE, TARGET))
     motion = Rigid(jnp.eye(3), jnp.asarray(TARGET.mean(0) - SOURCE.mean(0)))
-    look, solve = jax.jit(predict_overlap_and_matches), jax.jit(register_given_overlap)
+    predict, solve = jax.jit(predict_overlap_and_matches), jax.jit(register_given_overlap)
     for _ in range(config.overlap_passes):
-        *overlap, _ = look(params, source, target, start=motion)
+        *overlap, _ = predict(params, source, target, start=motion)
         moved = source._replace(points=rigid.apply(motion, source.points))
         step = solve(params, moved, target, *overlap)
         motion = rigid.compose(Rigid(step.rotation, step.translation), motion)

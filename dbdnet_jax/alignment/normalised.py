@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dbdnet_jax.alignment.downsampling import UNIT_SIZE, Thinned, thin
+from dbdnet_jax.alignment.downsampling import UNIT_SIZE, Downsampled, downsample
 from dbdnet_jax.alignment.search import Transform, as_transform, move
 from dbdnet_jax.io.point_files import MIN_POINTS
 
@@ -17,7 +17,7 @@ class Side(NamedTuple):
     """One cloud as given, the rows chosen of it, and these at the network's scale."""
 
     points: Points
-    thinned: Thinned
+    downsampled: Downsampled
     dense: Float[np.ndarray, "d 3"]
     sparse: Float[np.ndarray, "s 3"]
 
@@ -42,14 +42,14 @@ def build_scene(
     Raises:
       ValueError: a cloud whose points are at too few places.
     """
-    thinned = thin(source, max_points), thin(target, max_points)
-    for name, rows in zip(("source", "target"), thinned, strict=True):
+    downsampled = downsample(source, max_points), downsample(target, max_points)
+    for name, rows in zip(("source", "target"), downsampled, strict=True):
         if len(rows.sparse) < MIN_POINTS:
             raise ValueError(
                 f"{name} must have points at {MIN_POINTS} places at least; got "
                 f"{len(rows.sparse)}. Give more points."
             )
-    factor = UNIT_SIZE / max(rows.size for rows in thinned) if scale == "auto" else float(scale)
+    factor = UNIT_SIZE / max(rows.size for rows in downsampled) if scale == "auto" else float(scale)
 
     def side(points, rows, turn):
         dense, sparse = (
@@ -58,33 +58,36 @@ def build_scene(
         return Side(points, rows, dense, sparse)
 
     return Scene(
-        side(source, thinned[0], guess[:3, :3]), side(target, thinned[1], np.eye(3)), factor, guess
+        side(source, downsampled[0], guess[:3, :3]),
+        side(target, downsampled[1], np.eye(3)),
+        factor,
+        guess,
     )
 
 
 def guess_in_scene(scene: Scene) -> Transform:
     """The guess where the source has been turned by it already: a translation."""
     start = np.eye(4)
-    moved = move(scene.guess, scene.source.thinned.centre)
-    start[:3, 3] = (moved - scene.target.thinned.centre) * scene.factor
+    moved = move(scene.guess, scene.source.downsampled.centre)
+    start[:3, 3] = (moved - scene.target.downsampled.centre) * scene.factor
     return start
 
 
 def as_given(pose: Transform, scene: Scene) -> Transform:
     """A pose of the scene as one of the clouds as given."""
     transform = as_transform(pose[:3, :3] @ scene.guess[:3, :3], np.zeros(3))
-    moved = transform[:3, :3] @ scene.source.thinned.centre
-    transform[:3, 3] = pose[:3, 3] / scene.factor + scene.target.thinned.centre - moved
+    moved = transform[:3, :3] @ scene.source.downsampled.centre
+    transform[:3, 3] = pose[:3, 3] / scene.factor + scene.target.downsampled.centre - moved
     return transform
 
 
 def is_whole(scene: Scene) -> bool:
-    """Whether a pose is judged on all points of both clouds, but for strays."""
+    """Whether a pose is judged on all points of both clouds, but for outliers."""
     sides = scene.source, scene.target
-    return all(len(side.dense) + side.thinned.strays == len(side.points) for side in sides)
+    return all(len(side.dense) + side.downsampled.outliers == len(side.points) for side in sides)
 
 
 def size_ratio(scene: Scene) -> float:
     """The larger cloud's size per the smaller one's."""
-    sizes = scene.source.thinned.size, scene.target.thinned.size
+    sizes = scene.source.downsampled.size, scene.target.downsampled.size
     return max(sizes) / min(sizes)

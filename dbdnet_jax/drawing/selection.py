@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from dbdnet_jax.alignment.align import Alignment
-from dbdnet_jax.alignment.downsampling import thin
+from dbdnet_jax.alignment.downsampling import downsample
 from dbdnet_jax.alignment.search import move
 
 MATCHES_DRAWN = 60  # more lines hide each other
@@ -16,7 +16,7 @@ THINNEST = 0.1  # side of the box around a flat cloud, per longest side
 Corner = Float[np.ndarray, "3"]
 
 
-class View(NamedTuple):
+class DrawnPair(NamedTuple):
     """Two clouds as drawn: about ``origin``, the target's middle, in their own unit.
 
     ``before`` (n, 3) and ``after`` are the source as given and moved. Where the clouds lie
@@ -38,11 +38,11 @@ class View(NamedTuple):
     agrees: Bool[np.ndarray, " k"]
 
 
-def look(
+def select_points(
     alignment: Alignment, source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]
-) -> View:
+) -> DrawnPair:
     """Choose what to draw of an alignment of these clouds: at most 10,000 points of each."""
-    rows, columns = thin(source, 1).dense, thin(target, 1).dense
+    rows, columns = downsample(source, 1).dense, downsample(target, 1).dense
     origin = target[columns].mean(axis=0)
     start = source[rows].mean(axis=0)
     size = max(np.ptp(source[rows], axis=0).max(), np.ptp(target[columns], axis=0).max())
@@ -57,7 +57,7 @@ def look(
         ],
         axis=1,
     )
-    return View(
+    return DrawnPair(
         origin=origin,
         apart=apart,
         before=source[rows] - (start if apart else origin),
