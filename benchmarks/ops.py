@@ -3,7 +3,7 @@
     python -m benchmarks.ops --config=configs/modelnet.py
     python -m benchmarks.ops --config=configs/cad.py
 
-On random points in a cube: as many as the protocol's for the farthest order and `polish`, as the
+On random points in a cube: as many as the protocol's for the farthest order and `refine`, as the
 overlap network sees for its layers, as the registration matches for Sinkhorn and Procrustes. Prints
 JSON: for each operation seconds to trace and to compile, median and range of the wall seconds, and
 where its arithmetic is counted (`benchmarks.arithmetic`) what part it achieves of the rate at which
@@ -21,7 +21,7 @@ from ml_collections import config_flags
 
 from benchmarks import arithmetic
 from benchmarks.machine import against, compile_timed, matrix_rate, measure, publish, record
-from dbdnet_jax.classical.refine import polish
+from dbdnet_jax.classical.refine import refine
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.dbdnet.encoder import GROUPS
 from dbdnet_jax.networks.edgeconv import EdgeConv
@@ -82,8 +82,8 @@ def operations(config: ModelConfig, size: int) -> dict[str, Operation]:
             lambda x, y, w: jnp.concatenate([leaf.reshape(-1) for leaf in _motion(x, y, w)]),
             (cloud[:matched], other[:matched], jnp.ones(matched)),
         ),
-        "polish": Operation(
-            lambda x, y: polish(*_whole(x, y), rigid.identity()).target_from_source.rotation,
+        "refine": Operation(
+            lambda x, y: refine(*_whole(x, y), rigid.identity()).target_from_source.rotation,
             (cloud, cloud + 0.01),
         ),
     }

@@ -3,7 +3,7 @@
     python train.py --config=configs/cad_short.py
 
 Seven minutes on two cores, compilation and the table included. Expected on the noisy test pairs:
-Error R 23.2 degrees, Error t 0.391 (untrained 43.8 and 0.701); polished 11.2 and 0.222. The overlap
+Error R 23.2 degrees, Error t 0.391 (untrained 43.8 and 0.701); refined 11.2 and 0.222. The overlap
 network has hardly learned more than "all points overlap" by then (accuracy 0.786, F1 0.872), and
 the table says so.
 """

@@ -91,7 +91,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--batch", type=Path, metavar="PAIRS", help="a list of pairs, or a folder")
     add("--json", action="store_true", help="print JSON, a line for each pair, instead of text")
     add("--params", default="cad", metavar="W", help="weights: a .npz file, or a name (cad)")
-    add("--refine", action=argparse.BooleanOptionalAction, default=True, help="polish the pose")
+    add("--refine", action=argparse.BooleanOptionalAction, default=True, help="refine the pose")
     add("--initial", type=Path, metavar="T", help="a first guess of the transform")
     add("--scale", type=_scale, default="auto", help="factor to the weights' unit, or auto")
     add("--overlap-threshold", type=float, default=0.5, metavar="P", help="default 0.5")

@@ -103,7 +103,7 @@ def align(
       source: (n, 3) numbers, n >= 16, or a file; see `point_files.read_points`.
       target: the same, (m, 3), in the same unit.
       params: the network; the weights in the package, if None.
-      refine: polish the network's pose, from it and from near it, on up to 1,024 points of each
+      refine: refine the network's pose, from it and from near it, on up to 1,024 points of each
         cloud.
       scale: factor from the clouds' unit to the weights'; "auto" brings the larger cloud to the
         size of a partial scan of a shape in the unit sphere.
@@ -146,7 +146,7 @@ def _select_pose(starts: list[Transform], scene: NormalisedPair, refine: bool) -
     clouds = scene.source.sparse, scene.target.sparse
     if refine:
         best, _ = min(
-            (search.explore(pose, *clouds) for pose in starts), key=lambda found: found[1]
+            (search.refine_multistart(pose, *clouds) for pose in starts), key=lambda found: found[1]
         )
         return search.refine(best, scene.source.dense, scene.target.dense)
     if len(starts) == 1:

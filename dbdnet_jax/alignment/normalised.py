@@ -13,7 +13,7 @@ Points = Float[np.ndarray, "n 3"]
 OtherPoints = Float[np.ndarray, "m 3"]
 
 
-class Side(NamedTuple):
+class NormalisedCloud(NamedTuple):
     """One cloud as given, the rows chosen of it, and these at the network's scale."""
 
     points: Points
@@ -22,22 +22,22 @@ class Side(NamedTuple):
     sparse: Float[np.ndarray, "s 3"]
 
 
-class Scene(NamedTuple):
+class NormalisedPair(NamedTuple):
     """Both clouds, each about its own centre, the source turned by the guess, one scale.
 
     ``factor`` leads from the given unit to the network's.
     """
 
-    source: Side
-    target: Side
+    source: NormalisedCloud
+    target: NormalisedCloud
     factor: float
     guess: Transform
 
 
-def build_scene(
+def normalise_pair(
     source: Points, target: OtherPoints, scale: float | str, max_points: int, guess: Transform
-) -> Scene:
-    """Thin, centre, turn and scale two clouds, in float64.
+) -> NormalisedPair:
+    """Downsample, centre, turn and scale two clouds, in float64.
 
     Raises:
       ValueError: a cloud whose points are at too few places.
@@ -55,9 +55,9 @@ def build_scene(
         dense, sparse = (
             (points[x] - rows.centre) @ turn.T * factor for x in (rows.dense, rows.sparse)
         )
-        return Side(points, rows, dense, sparse)
+        return NormalisedCloud(points, rows, dense, sparse)
 
-    return Scene(
+    return NormalisedPair(
         side(source, downsampled[0], guess[:3, :3]),
         side(target, downsampled[1], np.eye(3)),
         factor,
@@ -65,7 +65,7 @@ def build_scene(
     )
 
 
-def guess_in_scene(scene: Scene) -> Transform:
+def normalised_guess(scene: NormalisedPair) -> Transform:
     """The guess where the source has been turned by it already: a translation."""
     start = np.eye(4)
     moved = move(scene.guess, scene.source.downsampled.centre)
@@ -73,7 +73,7 @@ def guess_in_scene(scene: Scene) -> Transform:
     return start
 
 
-def as_given(pose: Transform, scene: Scene) -> Transform:
+def as_given(pose: Transform, scene: NormalisedPair) -> Transform:
     """A pose of the scene as one of the clouds as given."""
     transform = as_transform(pose[:3, :3] @ scene.guess[:3, :3], np.zeros(3))
     moved = transform[:3, :3] @ scene.source.downsampled.centre
@@ -81,13 +81,13 @@ def as_given(pose: Transform, scene: Scene) -> Transform:
     return transform
 
 
-def is_whole(scene: Scene) -> bool:
+def is_full_resolution(scene: NormalisedPair) -> bool:
     """Whether a pose is judged on all points of both clouds, but for outliers."""
     sides = scene.source, scene.target
     return all(len(side.dense) + side.downsampled.outliers == len(side.points) for side in sides)
 
 
-def size_ratio(scene: Scene) -> float:
+def size_ratio(scene: NormalisedPair) -> float:
     """The larger cloud's size per the smaller one's."""
     sizes = scene.source.downsampled.size, scene.target.downsampled.size
     return max(sizes) / min(sizes)

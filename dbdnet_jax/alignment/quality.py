@@ -19,7 +19,7 @@ NORMAL_NEIGHBOURS = 16  # at least; of dense clouds a 250th part, to reach beyon
 # itself (root mean square); estimated normals of a noisy plane vary by about half of it.
 DEGENERATE = 0.1
 # Of `shared_point_score`: how near to 1 the ratio of distances is in 19 of 20 wrong poses of
-# validation pairs (being an inlier favours the point's own distance), and points that are enough to tell.
+# validation pairs (being an inlier favours the point's own distance), and points enough to tell.
 CHANCE_RATIO = 0.95
 ENOUGH_INLIERS = 1000
 
@@ -37,8 +37,8 @@ class PoseQuality(NamedTuple):
     ``inlier[i]``: source point i has a target point within ``distance``. ``rmse`` is over these
     pairs, ``plane_rmse`` over their distances along the target's normals. ``information`` (6, 6)
     is that of the latter for a small rotation about ``pivot`` and a small translation, the
-    noise's variance taken from the residuals; ``min_eigenvalue`` its smallest part per point, scaled
-    to 0 (free) .. 1/3 (held the same from all sides).
+    noise's variance taken from the residuals; ``min_eigenvalue`` its smallest part per point,
+    scaled to 0 (free) .. 1/3 (held the same from all sides).
     """
 
     inlier: Bool[np.ndarray, " n"]
@@ -102,9 +102,9 @@ def assess_pose(moved: Points, target: OtherPoints, distance: float) -> PoseQual
 def shared_point_score(moved: Points, target: OtherPoints, distance: float) -> float:
     """How much closer the inliers are to points of the target than a spacing beside them.
 
-    From 0 to `CHANCE_RATIO`. Two drawings of one surface leave it at 0 in any pose; points that both
-    clouds have in common show, and in the right pose only, even where the shape is symmetric. Not
-    for clouds that a grid has downsampled: its cells may coincide.
+    From 0 to `CHANCE_RATIO`. Two drawings of one surface leave it at 0 in any pose; points that
+    both clouds have in common show, and in the right pose only, even where the shape is symmetric.
+    Not for clouds that a grid has downsampled: its cells may coincide.
     """
     from scipy.spatial import cKDTree
 

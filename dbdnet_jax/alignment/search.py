@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from dbdnet_jax.alignment.quality import inlier_distance
-from dbdnet_jax.classical import refine as polish
+from dbdnet_jax.classical import refine as em_icp
 from dbdnet_jax.io.programs import load_or_trace
 from dbdnet_jax.networks.dbdnet.register import register_clouds
 from dbdnet_jax.networks.params import Params
@@ -20,7 +20,7 @@ OtherPoints = Float[np.ndarray, "m 3"]
 Transform = Float[np.ndarray, "4 4"]
 
 SMALLEST_BUCKET = 192
-FAR_DEG = (90.0, 180.0, 270.0)  # turns of symmetric shapes tell of doubt, and are not followed
+SYMMETRY_DEG = (90.0, 180.0, 270.0)  # turns of symmetric shapes tell of doubt, and are not followed
 CAP_PER_DISTANCE = 0.7  # the cap of residuals, per distance of inliers
 DIFFERENT_DEG = 15.0  # from the pose, of what counts as a alternative
 NO_ALTERNATIVE = 3.0  # the margin where there is none
@@ -91,26 +91,28 @@ def predict_pose(params: Params, source: Points, target: OtherPoints) -> Network
 
 
 def refine(pose: Transform, source: Points, target: OtherPoints) -> Transform:
-    """The pose after `polish` on an even part of the clouds."""
-    rotation, translation, *_ = _run_polish(polish.polish, pose, _even(source), _even(target))
+    """The pose after `classical.refine` on an even part of the clouds."""
+    rotation, translation, *_ = _run_em_icp(em_icp.refine, pose, _even(source), _even(target))
     return as_transform(rotation, translation)
 
 
 def _even(points: Points) -> Float[np.ndarray, "k 3"]:
-    """As many points as `polish` takes, evenly chosen."""
-    size = min(len(points), polish.MOST_POINTS)
+    """As many points as `classical.refine` takes, evenly chosen."""
+    size = min(len(points), em_icp.MOST_POINTS)
     return points[np.arange(size) * len(points) // size]
 
 
-def explore(pose: Transform, source: Points, target: OtherPoints) -> tuple[Transform, float]:
+def refine_multistart(
+    pose: Transform, source: Points, target: OtherPoints
+) -> tuple[Transform, float]:
     """The refined pose, or a refined neighbour of it that fits clearly better; and its RMSE."""
-    rotation, translation, residual, _ = _run_polish(polish.explore, pose, source, target)
-    return as_transform(rotation, translation), float(residual)
+    rotation, translation, rmse, _ = _run_em_icp(em_icp.refine_multistart, pose, source, target)
+    return as_transform(rotation, translation), float(rmse)
 
 
 def truncated_rmse(pose: Transform, source: Points, target: OtherPoints) -> float:
-    """How badly a pose fits: the `residual`, a length."""
-    return float(_run_polish(polish.residual, pose, source, target)[0])
+    """How badly a pose fits, a length; see `classical.refine`."""
+    return float(_run_em_icp(em_icp.truncated_rmse, pose, source, target)[0])
 
 
 def strongest_alternative(pose: Transform, source: Points, target: OtherPoints) -> AlternativePose:
@@ -118,7 +120,7 @@ def strongest_alternative(pose: Transform, source: Points, target: OtherPoints) 
 
     A turn that falls back to the pose itself, or to what refining would make of it, is none.
     """
-    *motions, residuals, _, own = _run_polish(_all_turns, pose, source, target)
+    *motions, residuals, _, own = _run_em_icp(_all_turns, pose, source, target)
     cap = _cap(source, target)
     margins = np.log(((residuals / cap) ** 2 + 1e-3) / ((own / cap) ** 2 + 1e-3))
     others = [as_transform(*motion) for motion in zip(*motions, strict=True)]
@@ -135,17 +137,17 @@ def strongest_alternative(pose: Transform, source: Points, target: OtherPoints) 
 
 def _all_turns(
     source: Cloud, target: Cloud, pose: Rigid, cap: jax.Array
-) -> tuple[polish.Polished, jax.Array]:
-    """The pose and its turns refined, and the residual of the pose as it is."""
-    turns = polish.NEAR_DEG + FAR_DEG
-    found = polish.polish_turns(source, target, pose, turns, cap)
-    return found, polish.residual(source, target, pose, cap)
+) -> tuple[em_icp.Refined, jax.Array]:
+    """The pose and its turns refined, and the truncated RMSE of the pose as it is."""
+    turns = em_icp.RESTART_DEG + SYMMETRY_DEG
+    found = em_icp.refine_from_rotations(source, target, pose, turns, cap)
+    return found, em_icp.truncated_rmse(source, target, pose, cap)
 
 
-def _run_polish(
+def _run_em_icp(
     function: Callable, pose: Transform, source: Points, target: OtherPoints
 ) -> list[np.ndarray]:
-    """The arrays that a function of `polish` gives for the pose."""
+    """The arrays that a function of `classical.refine` gives for the pose."""
 
     def arrays(source, target, start, cap):
         return tuple(jax.tree.leaves(function(Cloud(*source), Cloud(*target), Rigid(*start), cap)))
@@ -157,7 +159,7 @@ def _run_polish(
 
 def _cap(source: Points, target: OtherPoints) -> float:
     """Of residuals: more than the spacing of the points, which of sparse clouds is wide."""
-    return max(polish.CAP, CAP_PER_DISTANCE * inlier_distance(source, target))
+    return max(em_icp.CAP, CAP_PER_DISTANCE * inlier_distance(source, target))
 
 
 def _run(name: str, function: Callable, *arguments: Any) -> Any:

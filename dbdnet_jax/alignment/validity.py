@@ -42,8 +42,8 @@ def warnings(
 ) -> Iterator[str]:
     """What should be known even of a valid pose."""
     for name, side in (("source", scene.source), ("target", scene.target)):
-        if side.downsampled.outliers:
-            yield f"{side.downsampled.outliers} points of the {name}, far from the rest, were left out"
+        if outliers := side.downsampled.outliers:
+            yield f"{outliers} points of the {name}, far from the rest, were left out"
     if size_ratio(scene) > UNEQUAL:
         yield _unequal(scene)
     if (inliers := quality.inlier.mean()) < LOW_OVERLAP:

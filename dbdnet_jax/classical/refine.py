@@ -28,25 +28,26 @@ ITERATIONS = 30
 ISOTROPY = 0.1  # weight of the distance in all directions, beside 1 along each normal
 OUTLIER_MASS = 1.0  # a point is half matched when the kernel's sum over the other cloud is this
 NEIGHBOURS = 12  # of a point, for its normal
-CAP = 0.05  # of the residual: farther points count as if they were this far; more for sparse clouds
+# Of the truncated RMSE: farther points count as if they were this far; more for sparse clouds.
+CAP = 0.05
 SLACK = 0.02  # a refined pose may fit worse by this part: the right one of disjoint draws does
 MARGIN = 0.03  # a turned pose must fit better by this part
-NEAR_DEG = (-30.0, 30.0)  # turns that may lead out of a local minimum
+RESTART_DEG = (-30.0, 30.0)  # turns that may lead out of a local minimum
 MOST_POINTS = 1024  # of a cloud: the lengths above suit this density
 
 
-class Polished(NamedTuple):
-    """The refined motion, its residual (a length), and whether it replaced what it started from.
+class Refined(NamedTuple):
+    """The refined pose, its truncated RMSE (a length), and whether it replaced its start.
 
-    That may be a turn of the given pose, see `explore`.
+    That may be a turn of the given pose, see `refine_multistart`.
     """
 
     target_from_source: Rigid
-    residual: Float[Array, ""]
+    truncated_rmse: Float[Array, ""]
     accepted: Bool[Array, ""]
 
 
-class _Scene(NamedTuple):
+class _PreparedPair(NamedTuple):
     """Both clouds thinned, the target about its own centroid ``centre``, and their normals.
 
     So rotation and translation hardly depend on each other.
@@ -58,54 +59,54 @@ class _Scene(NamedTuple):
 
 
 @partial(jax.jit, static_argnames="iterations")
-def polish(
+def refine(
     source: Cloud,
     target: Cloud,
     initial: Rigid,
     cap: float | Float[Array, ""] = CAP,
     *,
     iterations: int = ITERATIONS,
-) -> Polished:
-    """Refine ``initial`` (target_from_source), or keep it where the `residual` rises by over 2 %.
+) -> Refined:
+    """Refine ``initial`` (target_from_source), or keep it if the truncated RMSE rises by over 2 %.
 
     Pure, of fixed cost, and without a gradient of use.
     """
-    return _polish(_prepare(source, target), initial, cap, iterations)
+    return _refine(_prepare(source, target), initial, cap, iterations)
 
 
 @partial(jax.jit, static_argnames="angles_deg")
-def polish_turns(
+def refine_from_rotations(
     source: Cloud,
     target: Cloud,
     initial: Rigid,
     angles_deg: tuple[float, ...],
     cap: float | Float[Array, ""] = CAP,
-) -> Polished:
+) -> Refined:
     """Refine a pose and its turns about the principal axes through the moved source's middle.
 
     Every leaf has a leading axis of 1 + 3 * len(angles_deg): first the pose itself.
     """
     scene = _prepare(source, target)
     starts = _turned(scene.views[0], initial, angles_deg)
-    return jax.lax.map(lambda start: _polish(scene, start, cap, ITERATIONS), starts)
+    return jax.lax.map(lambda start: _refine(scene, start, cap, ITERATIONS), starts)
 
 
 @jax.jit
-def explore(
+def refine_multistart(
     source: Cloud, target: Cloud, initial: Rigid, cap: float | Float[Array, ""] = CAP
-) -> Polished:
+) -> Refined:
     """The refined pose, or a refined turn of it by 30 degrees that fits clearly better.
 
     Slightly better is no reason: a wrong pose that lays more of the clouds over each other may
     fit as well as the right one.
     """
-    found = polish_turns(source, target, initial, NEAR_DEG, cap)
-    best = jnp.argmin(found.residual.at[0].multiply(1.0 - MARGIN))
+    found = refine_from_rotations(source, target, initial, RESTART_DEG, cap)
+    best = jnp.argmin(found.truncated_rmse.at[0].multiply(1.0 - MARGIN))
     return jax.tree.map(lambda leaf: leaf[best], found)
 
 
 @jax.jit
-def residual(
+def truncated_rmse(
     source: Cloud, target: Cloud, target_from_source: Rigid, cap: float | Float[Array, ""] = CAP
 ) -> Float[Array, ""]:
     """How badly a pose fits: root mean square distance of each cloud's points to the other cloud.
@@ -113,18 +114,18 @@ def residual(
     Distances above ``cap`` count as it, so points without a counterpart say little: 0 is a perfect
     fit of everything, ``cap`` none. It should exceed the distance between neighbours.
     """
-    return _residual((_thin(source), _thin(target)), target_from_source, cap)
+    return _truncated_rmse((_downsample(source), _downsample(target)), target_from_source, cap)
 
 
-def _prepare(source: Cloud, target: Cloud) -> _Scene:
-    source, target = _thin(source), _thin(target)
+def _prepare(source: Cloud, target: Cloud) -> _PreparedPair:
+    source, target = _downsample(source), _downsample(target)
     centre = _middle(target.points, target)
     target = target._replace(points=target.points - centre[None, :])
     normals = estimate_normals(*source, NEIGHBOURS), estimate_normals(*target, NEIGHBOURS)
-    return _Scene((source, target), normals, centre)
+    return _PreparedPair((source, target), normals, centre)
 
 
-def _thin(cloud: Cloud) -> Cloud:
+def _downsample(cloud: Cloud) -> Cloud:
     """At most MOST_POINTS rows, evenly over the valid ones; padding becomes zeros."""
     size = min(cloud.points.shape[0], MOST_POINTS)
     whole, part = jnp.divmod(jnp.maximum(cloud.count, size), size)
@@ -140,7 +141,7 @@ def _middle(points: Float[Array, "n 3"], cloud: Cloud) -> Float[Array, "3"]:
 
 
 def _turned(source: Cloud, pose: Rigid, angles_deg: tuple[float, ...]) -> Rigid:
-    """The pose and its turns, stacked; see `polish_turns`."""
+    """The pose and its turns, stacked; see `refine_from_rotations`."""
     moved = rigid.apply(pose, source.points)
     middle = _middle(moved, source)
     arms = jnp.where(_valid(source)[:, None], moved - middle[None, :], 0.0)
@@ -157,20 +158,20 @@ def _turned(source: Cloud, pose: Rigid, angles_deg: tuple[float, ...]) -> Rigid:
     return jax.vmap(about_middle)(turns)
 
 
-def _polish(
-    scene: _Scene, initial: Rigid, cap: float | Float[Array, ""], iterations: int
-) -> Polished:
+def _refine(
+    scene: _PreparedPair, initial: Rigid, cap: float | Float[Array, ""], iterations: int
+) -> Refined:
     start = Rigid(initial.rotation, initial.translation - scene.centre)
     radii = jnp.geomspace(FIRST_RADIUS, LAST_RADIUS, iterations)
     end = jax.lax.scan(lambda at, radius: (_step(scene, at, radius), None), start, radii)[0]
-    before, after = (_residual(scene.views, pose, cap) for pose in (start, end))
+    before, after = (_truncated_rmse(scene.views, pose, cap) for pose in (start, end))
     accepted = after <= (1.0 + SLACK) * before
     best = jax.tree.map(lambda new, old: jnp.where(accepted, new, old), end, start)
     motion = Rigid(best.rotation, best.translation + scene.centre)
-    return Polished(motion, jnp.where(accepted, after, before), accepted)
+    return Refined(motion, jnp.where(accepted, after, before), accepted)
 
 
-def _residual(
+def _truncated_rmse(
     views: tuple[Cloud, Cloud], motion: Rigid, cap: float | Float[Array, ""]
 ) -> Float[Array, ""]:
     source, target = views
@@ -187,7 +188,7 @@ def _valid(cloud: Cloud) -> Bool[Array, " n"]:
     return prefix_mask(len(cloud.points), cloud.count)
 
 
-def _step(scene: _Scene, motion: Rigid, radius: Float[Array, ""]) -> Rigid:
+def _step(scene: _PreparedPair, motion: Rigid, radius: Float[Array, ""]) -> Rigid:
     """One Gauss-Newton step on ``sum_ij P_ij e^T M_ij e`` with ``e = R s_i + t - q_j``.
 
     P is the soft matching and ``M_ij = 0.1 I + 0.9 (a_i a_i^T + b_j b_j^T)``, a and b the normals.

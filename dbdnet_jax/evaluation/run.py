@@ -19,7 +19,7 @@ from dbdnet_jax.classical.open3d import (
     icp_centred,
     identity,
 )
-from dbdnet_jax.classical.refine import explore
+from dbdnet_jax.classical.refine import refine_multistart
 from dbdnet_jax.data.test_pairs import PairSet
 from dbdnet_jax.errors import MissingExtraError
 from dbdnet_jax.metrics.pose import (
@@ -97,8 +97,8 @@ def evaluate(
         scans = scans and scans.first(count)
         symmetric = symmetric if symmetric is None else symmetric[:count]
     methods = make_methods(params, seed)
-    if scans is not None:  # the lengths of `polish` are those of a shape in the unit sphere
-        methods.pop("DBDNet, polished", None)
+    if scans is not None:  # the lengths of `refine` are those of a shape in the unit sphere
+        methods.pop("DBDNet, refined", None)
     return Evaluation(
         rows=evaluate_methods(possible(methods, pairs), pairs, scans),
         constant_overlap=constant_overlap(pairs),
@@ -132,7 +132,7 @@ def make_methods(params: Params, seed: int) -> dict[str, Method]:
         name: network(params),
     }
     if params.overlap is not None:
-        methods["DBDNet, polished"] = from_polished_network(params)
+        methods["DBDNet, refined"] = from_refined_network(params)
     return methods
 
 
@@ -175,9 +175,9 @@ def from_network(params: Params) -> Method:
     return lambda pair: compiled(params, pair)
 
 
-def from_polished_network(params: Params) -> Method:
-    """The network's motion, refined as `explore` does: no ground truth, no normals given."""
-    compiled = jax.jit(_register_and_polish)
+def from_refined_network(params: Params) -> Method:
+    """The network's pose after `refine_multistart`: no ground truth, no normals given."""
+    compiled = jax.jit(_register_and_refine)
     return lambda pair: compiled(params, pair)
 
 
@@ -258,10 +258,10 @@ def _register(params: Params, pair: Pair) -> Registration:
     return register_clouds(params, pair.source, pair.target)
 
 
-def _register_and_polish(params: Params, pair: Pair) -> Rigid:
+def _register_and_refine(params: Params, pair: Pair) -> Rigid:
     answer = _register(params, pair)
     motion = Rigid(answer.rotation, answer.translation)
-    return explore(pair.source, pair.target, motion).target_from_source
+    return refine_multistart(pair.source, pair.target, motion).target_from_source
 
 
 def _register_given_labels(params: Params, pair: Pair) -> Rigid:

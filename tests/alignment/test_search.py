@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dbdnet_jax.alignment import search
-from dbdnet_jax.classical import refine as polish
+from dbdnet_jax.classical import refine as refine
 from tests.aligning import solid
 
 
@@ -62,5 +62,5 @@ def test_refining_takes_as_many_points_as_it_can(monkeypatch, count):
     )
     search.refine(np.eye(4), solid(count, 0), solid(2 * count, 1))
     assert [len(points) for points in seen] == [
-        min(n, polish.MOST_POINTS) for n in (count, 2 * count)
+        min(n, refine.MOST_POINTS) for n in (count, 2 * count)
     ]

@@ -8,7 +8,13 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from dbdnet_jax.classical import refine as module
-from dbdnet_jax.classical.refine import CAP, explore, polish, polish_turns, residual
+from dbdnet_jax.classical.refine import (
+    CAP,
+    refine,
+    refine_from_rotations,
+    refine_multistart,
+    truncated_rmse,
+)
 from dbdnet_jax.data.procedural.shapes import procedural_shapes
 from dbdnet_jax.types import Cloud, Rigid
 from tests.conftest import EXACT, FLOAT32, Tolerance, assert_close, assert_finite
@@ -53,18 +59,18 @@ def angle_deg(found: Rigid) -> float:
 
 
 def test_a_perfect_pose_stays(points):
-    found = polish(cloud(points), cloud(points), IDENTITY)
+    found = refine(cloud(points), cloud(points), IDENTITY)
     assert_close(found.target_from_source.rotation, np.eye(3), Tolerance(0.0, SMALL))
     assert_close(found.target_from_source.translation, np.zeros(3), Tolerance(0.0, SMALL))
-    assert found.residual < 1e-3  # the square root of float32's error of a squared distance
+    assert found.truncated_rmse < 1e-3  # the square root of float32's error of a squared distance
 
 
 @pytest.mark.parametrize("degrees", [3.0, 8.0, 15.0])
 def test_a_pose_near_the_truth_comes_closer(crops, degrees):
     start = motion(degrees, 0.03)
-    found = polish(*crops, start)
+    found = refine(*crops, start)
     assert found.accepted
-    assert found.residual < residual(*crops, start)
+    assert found.truncated_rmse < truncated_rmse(*crops, start)
     assert angle_deg(found.target_from_source) < 1.5
     assert np.linalg.norm(found.target_from_source.translation) < 0.03
 
@@ -77,8 +83,8 @@ def test_the_answer_moves_with_the_clouds(crops):
     turned = Cloud(source.points @ turn.rotation.T, source.count)
     shifted = Cloud(target.points + offset[None, :], target.count)
     given = Rigid(start.rotation @ turn.rotation.T, start.translation + offset)
-    found = polish(turned, shifted, given).target_from_source
-    plain = polish(source, target, start).target_from_source
+    found = refine(turned, shifted, given).target_from_source
+    plain = refine(source, target, start).target_from_source
     assert_close(found.rotation @ turn.rotation, plain.rotation, Tolerance(0.0, 2e-3))
     assert_close(found.translation - offset, plain.translation, Tolerance(0.0, 2e-3))
 
@@ -88,27 +94,27 @@ def test_a_result_that_fits_worse_is_rejected(crops, monkeypatch):
         module, "_step", lambda _, at, __: at._replace(translation=at.translation + 0.01)
     )
     start = motion(1.0)
-    found = polish(*crops, start, iterations=9)  # a program of its own
+    found = refine(*crops, start, iterations=9)  # a program of its own
     assert not found.accepted
     assert_close(found.target_from_source.rotation, start.rotation, EXACT)
     assert_close(found.target_from_source.translation, start.translation, FLOAT32)
-    assert_close(found.residual, residual(*crops, start), FLOAT32)
+    assert_close(found.truncated_rmse, truncated_rmse(*crops, start), FLOAT32)
 
 
 @pytest.mark.parametrize(("worse", "accepted"), [(1.01, True), (1.04, False)])
 def test_a_pose_may_fit_worse_by_two_percent(crops, monkeypatch, worse, accepted):
     """The right pose of disjoint draws often fits a little worse than the one before."""
     values = iter((0.03, 0.03 * worse))
-    monkeypatch.setattr(module, "_residual", lambda *_: jnp.float32(next(values)))
-    found = polish(*crops, motion(1.0), iterations=3 if accepted else 4)  # programs of their own
+    monkeypatch.setattr(module, "_truncated_rmse", lambda *_: jnp.float32(next(values)))
+    found = refine(*crops, motion(1.0), iterations=3 if accepted else 4)  # programs of their own
     assert bool(found.accepted) is accepted
 
 
 def test_padding_changes_nothing(crops):
     start = motion(5.0, 0.02)
     longer = [cloud(np.asarray(c.points)[: int(c.count)], 2 * SIZE) for c in crops]
-    assert_close(residual(*longer, start), residual(*crops, start), FLOAT32)
-    short, long = (polish(*pair, start).target_from_source for pair in (crops, longer))
+    assert_close(truncated_rmse(*longer, start), truncated_rmse(*crops, start), FLOAT32)
+    short, long = (refine(*pair, start).target_from_source for pair in (crops, longer))
     assert_close(long.rotation, short.rotation, PADDING)
     assert_close(long.translation, short.translation, PADDING)
 
@@ -119,14 +125,14 @@ def test_the_residual_equals_its_definition(crops):
     moved = source @ np.float64(start.rotation).T + np.float64(start.translation)
     ways = cKDTree(target).query(moved)[0], cKDTree(moved).query(target)[0]
     expected = np.sqrt((np.minimum(np.concatenate(ways), CAP) ** 2).mean())
-    assert_close(residual(*crops, start), expected, Tolerance(rtol=1e-4, atol=0.0))
+    assert_close(truncated_rmse(*crops, start), expected, Tolerance(rtol=1e-4, atol=0.0))
 
 
 def test_turns_are_polished_each_for_itself(crops):
     """About the principal axes through the middle of the moved source, the pose itself first."""
     source, target = crops
     pose = motion(6.0, 0.02)
-    found = polish_turns(source, target, pose, (-120.0, 120.0))
+    found = refine_from_rotations(source, target, pose, (-120.0, 120.0))
     moved = np.float64(source.points[: int(source.count)]) @ np.float64(pose.rotation).T + 0.02
     middle = moved.mean(axis=0)
     for k, axis in enumerate(np.linalg.svd(moved - middle)[2][::-1]):
@@ -134,41 +140,41 @@ def test_turns_are_polished_each_for_itself(crops):
         for degrees in (-120, 120):
             turn = Rotation.from_rotvec(degrees * axis, degrees=True).as_matrix()
             start = Rigid(turn @ pose.rotation, middle + turn @ (pose.translation - middle))
-            ends.append(polish(source, target, jax.tree.map(jnp.float32, start)))
+            ends.append(refine(source, target, jax.tree.map(jnp.float32, start)))
         # An axis may point either way, so the two turns about it may change places.
         rows = [1 + 2 * k, 2 + 2 * k]
-        if abs(float(found.residual[rows[0]] - ends[0].residual)) > 1e-5:
+        if abs(float(found.truncated_rmse[rows[0]] - ends[0].truncated_rmse)) > 1e-5:
             rows.reverse()
         for row, end in zip(rows, ends, strict=True):
             here = jax.tree.map(lambda leaf, row=row: leaf[row], found.target_from_source)
             assert_close(here.rotation, end.target_from_source.rotation, Tolerance(0.0, 0.02))
             assert_close(here.translation, end.target_from_source.translation, Tolerance(0.0, 0.02))
-    own = polish(source, target, pose)
+    own = refine(source, target, pose)
     assert_close(found.target_from_source.rotation[0], own.target_from_source.rotation, PADDING)
 
 
-def test_explore_leaves_a_local_minimum_and_trusts_the_first(crops, monkeypatch):
+def test_restarts_leave_a_local_minimum_and_trusts_the_first(crops, monkeypatch):
     source, target = crops
     lost = motion(78.0)
-    assert angle_deg(polish(source, target, lost).target_from_source) > 5
-    assert angle_deg(explore(source, target, lost).target_from_source) < 2
+    assert angle_deg(refine(source, target, lost).target_from_source) > 5
+    assert angle_deg(refine_multistart(source, target, lost).target_from_source) < 2
     monkeypatch.setattr(module, "MARGIN", 0.95)  # no other pose fits so much better
-    explore.clear_cache()
-    trusting = explore(source, target, lost).target_from_source
-    explore.clear_cache()
+    refine_multistart.clear_cache()
+    trusting = refine_multistart(source, target, lost).target_from_source
+    refine_multistart.clear_cache()
     assert_close(
-        trusting.rotation, polish(source, target, lost).target_from_source.rotation, PADDING
+        trusting.rotation, refine(source, target, lost).target_from_source.rotation, PADDING
     )
 
 
 def test_large_clouds_are_thinned_evenly(points):
     limit = module.MOST_POINTS
     dense = np.tile(points, (10, 1))
-    fewer = module._thin(cloud(dense, 4096))
+    fewer = module._downsample(cloud(dense, 4096))
     assert fewer.points.shape == (limit, 3) and fewer.count == limit
     rows = np.arange(limit) * len(dense) // limit
     assert_close(fewer.points, np.float32(dense[rows]), EXACT)
-    few = module._thin(cloud(points, 4096))
+    few = module._downsample(cloud(points, 4096))
     assert few.count == SIZE
     assert_close(few.points[:SIZE], np.float32(points), EXACT)
 
@@ -176,9 +182,9 @@ def test_large_clouds_are_thinned_evenly(points):
 def test_clouds_of_little_use_keep_the_pose_finite(degenerate):
     start = motion(10.0, 0.1)
     for other in (degenerate, degenerate + 9.0, degenerate[:1]):
-        found = polish(cloud(degenerate), cloud(other), start)
-        assert_finite((found, explore(cloud(degenerate), cloud(other), start)))
+        found = refine(cloud(degenerate), cloud(other), start)
+        assert_finite((found, refine_multistart(cloud(degenerate), cloud(other), start)))
         rotation = np.asarray(found.target_from_source.rotation)
         assert_close(rotation @ rotation.T, np.eye(3), Tolerance(0.0, SMALL))
     nothing = cloud(np.zeros((0, 3)))
-    assert_finite(polish(nothing, nothing, start))
+    assert_finite(refine(nothing, nothing, start))

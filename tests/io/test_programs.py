@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dbdnet_jax.alignment import search
-from dbdnet_jax.classical.refine import Polished
+from dbdnet_jax.classical.refine import Refined
 from dbdnet_jax.io import programs
 from dbdnet_jax.ops.sampling import prefix_mask
 from dbdnet_jax.types import Branch, Registration, Rigid
@@ -56,19 +56,19 @@ def test_a_kept_program_depends_on_every_file_that_it_is_traced_through():
 
 
 def test_fifty_sizes_are_traced_as_often_as_there_are_buckets(monkeypatch):
-    networks, polishes = [], []
+    networks, refinements = [], []
 
     def register_clouds(params, source, target):
         networks.append((len(source.points), len(target.points)))
         return answer_nothing(params, source, target)
 
     @jax.jit
-    def polish(source, target, start, cap):
-        polishes.append((len(source.points), len(target.points)))
-        return Polished(Rigid(*start), jnp.zeros(()), jnp.ones((), bool))
+    def refine(source, target, start, cap):
+        refinements.append((len(source.points), len(target.points)))
+        return Refined(Rigid(*start), jnp.zeros(()), jnp.ones((), bool))
 
     monkeypatch.setattr(search, "register_clouds", register_clouds)
-    monkeypatch.setattr(search.polish, "polish", polish)
+    monkeypatch.setattr(search.em_icp, "refine", refine)
     monkeypatch.setattr(search, "_PROGRAMS", {})
     # Not through files: the stand-in must not be kept as the network's program.
     monkeypatch.setattr(search, "load_or_trace", lambda function, *rest: jax.jit(function))
@@ -78,7 +78,7 @@ def test_fifty_sizes_are_traced_as_often_as_there_are_buckets(monkeypatch):
         assert proposal.mass.shape == (n, m)
         assert proposal.source_kept.all() and proposal.target_overlap.all()
         search.refine(proposal.transform, source, target)
-    for traces in (networks, polishes):
+    for traces in (networks, refinements):
         assert len(traces) == len(set(traces)) <= len(BUCKETS)
         assert {size for pair in traces for size in pair} <= BUCKETS
 

@@ -1,6 +1,6 @@
-"""What `polish` makes of true poses that were perturbed, on validation pairs of the CAD shapes.
+"""What `refine` makes of true poses that were perturbed, on validation pairs of the CAD shapes.
 
-    python -m benchmarks.polish
+    python -m benchmarks.refine
 
 Poses are turned by 2 to 30 degrees about the moved source's centroid and shifted by 0.05 to 0.1.
 A row for each protocol, method and angle: mean and median rotation error in degrees, mean
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from dbdnet_jax.classical.refine import explore, polish
+from dbdnet_jax.classical.refine import refine, refine_multistart
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.pairs import Protocol, make_pair
 from dbdnet_jax.metrics.pose import motion_errors
@@ -50,19 +50,19 @@ def perturbed(key: PRNGKeyArray, pair: Pair, degrees: Float[Array, ""]) -> Rigid
 
 
 def plain(pair: Pair, start: Rigid) -> Rigid:
-    """`polish` of one pose."""
-    return polish(pair.source, pair.target, start).target_from_source
+    """`refine` of one pose."""
+    return refine(pair.source, pair.target, start).target_from_source
 
 
 def from_turns(pair: Pair, start: Rigid) -> Rigid:
-    """`explore`: of the refined pose and its refined turns the one that fits clearly better."""
-    return explore(pair.source, pair.target, start).target_from_source
+    """Of the refined pose and its refined turns the one that fits clearly better."""
+    return refine_multistart(pair.source, pair.target, start).target_from_source
 
 
 METHODS = {
     "start": lambda pair, start: start,
-    "polish": plain,
-    "explore": from_turns,
+    "refine": plain,
+    "refine_multistart": from_turns,
 }
 
 
