@@ -124,8 +124,8 @@ def test_a_stage_may_resume_only_with_what_decides_its_outcome():
         ({"data__name": "modelnet"}, r"one of \('cad', 'modelnet40', 'threedmatch'\); got 'mod"),
         ({"train__log_every": 30}, r"validate_every must be a multiple of .*log_every = 30"),
         ({"train__validation_pairs": 0}, r"validation_pairs must be at least 1; got 0"),
-        ({"overlap__epochs": 0.0}, r"config\.overlap must have epochs > 0"),
-        ({"joint__batch_size": 0}, r"config\.joint must have .*; got epochs=8.0, batch_size=0"),
+        ({"overlap__epochs": 0.0}, r"config\.overlap\.epochs must be positive; got 0"),
+        ({"joint__batch_size": 0}, r"config\.joint\.batch_size must be from 1 .*; got 0"),
         (
             {"data__augment": 1.5},
             r"config\.data\.augment must be in \[0, 1\].*; got 1\.5 for 'cad'",

@@ -10,7 +10,7 @@ import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 from jaxtyping import PRNGKeyArray
 
-from dbdnet_jax.io.safe_pickle import CheckpointError
+from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.dbdnet.matching import FIT_FEATURES
 from dbdnet_jax.ops.pyramid import LEVELS
@@ -133,6 +133,18 @@ def require_shapes(found: Shapes, expected: Shapes, owner: str, fix: str) -> Non
             if entries
         )
         raise CheckpointError(f"{owner} must hold exactly the network's parameters; {lists}. {fix}")
+
+
+def require_finite(arrays: Mapping[str, np.ndarray], owner: str) -> None:
+    """Raise ``CheckpointError`` listing the arrays that have no finite float32 for every number."""
+    with np.errstate(over="ignore"):
+        bad = [name for name, x in arrays.items() if not np.isfinite(np.asarray(x, "f4")).all()]
+    if bad:
+        raise CheckpointError(
+            f"{owner} must hold finite numbers; NaN, infinity or more than float32 holds is in "
+            f"{len(bad)} of {len(arrays)} arrays: {', '.join(bad[:_LISTED])}. Train again, or "
+            "fetch the file again."
+        )
 
 
 def _affine(shapes: Shapes, name: str, fan_in: int, fan_out: int) -> None:

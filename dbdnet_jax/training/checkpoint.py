@@ -16,8 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.io.files import write_atomic
-from dbdnet_jax.io.safe_pickle import CheckpointError
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.params import NETWORKS, Params
 

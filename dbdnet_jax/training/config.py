@@ -16,6 +16,8 @@ from dbdnet_jax.data.pairs import Protocol
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.training.losses import LossWeights
 
+LARGEST = 1e15  # of any number: whole numbers below it are exact as floats, and no count is larger
+LARGEST_BATCH = 2**16  # pairs of a step, all of which are in memory
 MASKS = ("predicted", "truth", "perturbed")
 
 
@@ -42,7 +44,20 @@ class TrainConfig:
     devices: int  # XLA devices on a CPU; 0: one for each core
 
     def __post_init__(self):
-        """Refuse cadences that do not fit each other: a resumed log must equal an unbroken one."""
+        """Refuse what cannot be trained with.
+
+        Cadences must fit each other: a resumed log must equal an unbroken one.
+        """
+        for name in ("weight_decay", "warmup_epochs", "clip_norm", "devices", "seed"):
+            if getattr(self, name) < 0:
+                raise ValueError(
+                    f"config.train.{name} must not be negative; got {getattr(self, name)}. Use 0."
+                )
+        _check_steps("train", self.batch_size, self.learning_rate)
+        if not 0 <= self.ema_decay < 1:
+            raise ValueError(
+                f"config.train.ema_decay must be in [0, 1); got {self.ema_decay}. Use 0 for none."
+            )
         for name in ("log_every", "validate_every", "checkpoint_every", "validation_pairs"):
             value = getattr(self, name)
             if value < 1:
@@ -66,6 +81,10 @@ class OverlapConfig:
     def __post_init__(self):
         """Refuse a stage of nothing."""
         _check_stage("overlap", self)
+        if self.gamma < 0:
+            raise ValueError(
+                f"config.overlap.gamma must not be negative; got {self.gamma}. Use 4."
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,6 +105,11 @@ class RegistrationConfig:
     def __post_init__(self):
         """Refuse a stage of nothing, and masks that there are not."""
         _check_stage("registration", self)
+        for name, weight in dataclasses.asdict(self.weights).items():
+            if weight < 0:
+                raise ValueError(
+                    f"config.registration.weights.{name} must not be negative; got {weight}. Use 0."
+                )
         if self.masks not in MASKS:
             raise ValueError(
                 f"config.registration.masks must be one of {MASKS}; got {self.masks!r}. Choose one."
@@ -152,14 +176,37 @@ def read_record(record: type, section: Mapping[str, Any], where: str) -> Any:
             f"{where} must hold every field of {record.__name__}; it lacks {', '.join(missing)}. "
             "Start from a config in configs/ and state only the differences."
         )
-    return record(
-        **{
-            name: read_record(types[name], value, f"{where}.{name}")
-            if dataclasses.is_dataclass(types[name])
-            else value
-            for name, value in section.items()
-        }
-    )
+    values = {
+        name: _read_value(types[name], value, f"{where}.{name}") for name, value in section.items()
+    }
+    try:
+        return record(**values)
+    except ValueError as error:
+        if str(error).startswith("config."):
+            raise
+        raise ValueError(f"in {where}: {error}") from error
+
+
+def _read_value(kind: Any, value: Any, where: str) -> Any:
+    """A field's value: of the field's type, and finite; for a nested record, the record."""
+    if dataclasses.is_dataclass(kind):
+        if not isinstance(value, Mapping):
+            raise ValueError(
+                f"{where} must be a section of fields; got {value!r:.60}. Start from a config in "
+                "configs/."
+            )
+        return read_record(typing.cast(type, kind), value, where)
+    accepted = (int, float) if kind is float else kind
+    if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
+        raise ValueError(
+            f"{where} must be of type {kind.__name__}; got {value!r:.60} "
+            f"({type(value).__name__}). Give a value of that type."
+        )
+    if isinstance(value, int | float) and not abs(value) < LARGEST:
+        raise ValueError(
+            f"{where} must be finite and below {LARGEST:g}; got {value!r:.60}. Give such a number."
+        )
+    return value
 
 
 def stage_record(config: RunConfig, stage: str) -> dict[str, Any]:
@@ -172,10 +219,19 @@ def stage_record(config: RunConfig, stage: str) -> dict[str, Any]:
 
 
 def _check_stage(name: str, stage: OverlapConfig | RegistrationConfig | JointConfig) -> None:
-    if stage.epochs <= 0 or stage.batch_size < 1:
+    if stage.epochs <= 0:
+        raise ValueError(f"config.{name}.epochs must be positive; got {stage.epochs}. Use 1.")
+    _check_steps(name, stage.batch_size, stage.learning_rate)
+
+
+def _check_steps(name: str, batch_size: int, learning_rate: float) -> None:
+    if not 1 <= batch_size <= LARGEST_BATCH:
         raise ValueError(
-            f"config.{name} must have epochs > 0 and batch_size >= 1; got epochs={stage.epochs}, "
-            f"batch_size={stage.batch_size}."
+            f"config.{name}.batch_size must be from 1 to {LARGEST_BATCH}; got {batch_size}. Use 8."
+        )
+    if learning_rate <= 0:
+        raise ValueError(
+            f"config.{name}.learning_rate must be positive; got {learning_rate}. Use 1e-4."
         )
 
 
@@ -195,6 +251,8 @@ def parse_flags(arguments: list[str]) -> list[str]:
             f"error: only fields of the configuration can be set; it has no {field}. "
             f"{' '.join(hint)}".rstrip()
         ) from None
+    except (ValueError, TypeError) as error:  # a value that is of another type than its field
+        raise SystemExit(f"error: {error}") from None
     path = config_flags.get_config_filename(flags.FLAGS["config"])
     if not Path(path).is_file():
         raise SystemExit(

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dbdnet_jax.data.pairs import initial_pose, perturbed_overlap, transform_source
-from dbdnet_jax.io.safe_pickle import CheckpointError
+from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.metrics.pose import pair_confusion, registration_errors
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.dbdnet.register import (

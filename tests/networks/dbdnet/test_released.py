@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dbdnet_jax.io.safe_pickle import CheckpointError
+from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.dbdnet.released import from_released, to_released
 from dbdnet_jax.networks.params import flatten, parameter_shapes, unflatten
