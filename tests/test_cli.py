@@ -14,7 +14,8 @@ import pytest
 from dbdnet_jax import save_params
 from dbdnet_jax.alignment.writing import write_ply
 from dbdnet_jax.cli import ALIGNED, UNSURE, UNUSABLE, main
-from dbdnet_jax.io.point_files import read_points, read_transform
+from dbdnet_jax.io.point_files import read_points
+from dbdnet_jax.io.transform_files import read_transform
 from tests.aligning import POINTS, pair, rotation_error_deg, tiny_align, tiny_params
 
 ALIGN = importlib.import_module("dbdnet_jax.alignment.align")  # not the function

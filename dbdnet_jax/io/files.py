@@ -31,12 +31,21 @@ def cache_folder(name: str) -> Path | None:
 
 
 def require_writable(folder: Path) -> None:
-    """Raise ``OSError`` unless files can be made in the folder: asked of the disk, not the mode."""
-    probe = folder / f".{uuid.uuid4().hex[:8]}.tmp"
+    """Refuse a folder that files cannot be made in, or that cannot be made itself.
+
+    Raises:
+      OSError: says why; asked of the disk, since a mode says nothing to root or of a full disk.
+    """
+    there = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    probe = there / f".{uuid.uuid4().hex}.tmp"
     try:
-        probe.touch(exist_ok=False)
-    finally:
-        probe.unlink(missing_ok=True)
+        probe.write_bytes(b"?")
+        probe.unlink()
+    except OSError as error:
+        raise type(error)(
+            f"the folder {folder} must be one that files can be written to; {there}: "
+            f"{error.strerror}. Choose another, or make room."
+        ) from error
 
 
 @functools.cache  # once for each reason, however many programs are kept

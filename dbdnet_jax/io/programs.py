@@ -2,6 +2,8 @@
 
 import functools
 import hashlib
+import threading
+import time
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +22,7 @@ TRACED = (
     "alignment/search.py",
 )
 _FOLDER = "jax_compilation_cache_dir"
+_SPENT = threading.local()
 _ZSTANDARD = b"\x28\xb5\x2f\xfd"  # how its frames begin
 
 
@@ -46,19 +49,48 @@ def keep_compiled_programs() -> None:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
 
 
-def load_or_trace(function: Callable, name: str, *arguments) -> Callable:
-    """``function`` jitted for arguments like these, through a file where JAX keeps its programs.
+def require_device() -> None:
+    """Start JAX on the platform that it is told to use.
 
-    That is ``jax_compilation_cache_dir``; where it is not set, plain `jax.jit`. ``arguments`` and
+    Raises:
+      ValueError: this machine has no such platform.
+    """
+    try:
+        jax.devices()
+    except RuntimeError as error:
+        raise ValueError(
+            f"JAX_PLATFORMS must name platforms that this machine has; got "
+            f"{jax.config.values['jax_platforms']!r} ({' '.join(str(error).split())[:300]}). Unset "
+            "it, or use JAX_PLATFORMS=cpu."
+        ) from error
+
+
+def load_or_trace(function: Callable, name: str, *arguments) -> Callable:
+    """``function`` compiled for arguments like these, through a file where JAX keeps its programs.
+
+    That is ``jax_compilation_cache_dir``; where it is not set, without one. ``arguments`` and
     results must be arrays in dicts, lists and tuples. The file's name is the hash of ``name``, the
     arguments' structure and shapes, the source that is traced, precisions and versions; it starts
     with the hash of the rest, so that a damaged one is made again. A folder that cannot be written
     costs a warning.
     """
+    start = time.perf_counter()
+    try:
+        return _compiled(function, name, arguments)
+    finally:
+        _SPENT.seconds = loading_seconds() + time.perf_counter() - start
+
+
+def loading_seconds() -> float:
+    """How long this thread has spent in `load_or_trace`: no part of an alignment's work."""
+    return getattr(_SPENT, "seconds", 0.0)
+
+
+def _compiled(function: Callable, name: str, arguments: tuple) -> Callable:
     folder = jax.config.values[_FOLDER]
-    if not folder:
-        return jax.jit(function)
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), arguments)
+    if not folder:
+        return jax.jit(function).lower(*shapes).compile()
     # Of this thread, where a context manager may have changed them.
     precision = (jax.config.jax_enable_x64, jax.config.jax_default_matmul_precision)
     versions = jax.__version__, jaxlib.__version__
@@ -68,7 +100,7 @@ def load_or_trace(function: Callable, name: str, *arguments) -> Callable:
     if exported is None:
         exported = export.export(jax.jit(function))(*shapes)
         _keep(path, exported)
-    return jax.jit(exported.call)
+    return jax.jit(exported.call).lower(*shapes).compile()
 
 
 def _read_kept(path: Path) -> export.Exported | None:

@@ -1,6 +1,7 @@
 """What is printed: one line at a time, with nothing in it that would steer the terminal."""
 
 import os
+import re
 import sys
 from typing import TextIO
 
@@ -31,14 +32,30 @@ def say(*lines: str, to_stderr: bool = False) -> None:
         stream.flush()
     except OSError:
         if not to_stderr:
+            _mute_stdout()
             raise
     except ValueError:  # of a closed file
         pass
 
 
-def mute_stdout() -> None:
+def _mute_stdout() -> None:
     """Let what is still in standard output's buffer go nowhere, without a word at exit."""
     try:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (OSError, ValueError, AttributeError):  # no stream, or none of a file
         pass
+
+
+def for_command_line(text: str) -> str:
+    """Advice for Python as advice for the command line: ``initial=`` is ``--initial``."""
+    options = "initial|scale|overlap_threshold|max_points|seed|search"
+
+    def option(found: re.Match[str]) -> str:
+        return f"--{found[1].replace('_', '-')}{found[2] and ' '}{found[2]}{found[3]}"
+
+    text = re.sub(rf"`*\b({options})=['\"]?([\w.]*)['\"]?`*()", option, text)
+    text = re.sub(rf"^({options})()( must)", option, text)
+    # What to type in Python to mend an array does not mend a file.
+    return re.sub(
+        r"(Rows are points: )?[Gg]ive [^ ]*(points|values)[.[].*$", "Mend the file.", text
+    )

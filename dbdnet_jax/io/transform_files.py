@@ -1,6 +1,6 @@
 """Rigid transforms from files: what trackers, viewers and people write for one 4x4 matrix."""
 
-import ast
+import io
 import json
 import re
 from pathlib import Path
@@ -31,13 +31,13 @@ def read_transform(path: Path) -> np.ndarray:
         if len(data) > _LARGEST:
             raise ValueError(f"it has more than {_LARGEST} bytes")
         if data[:6] == b"\x93NUMPY":
-            return np.load(path, allow_pickle=False)
+            return np.load(io.BytesIO(data), allow_pickle=False)
         text = _decode(data)
         if path.suffix.lower() == ".json":
             held = json.loads(text)
             return np.array(held["transform"] if isinstance(held, dict) else held, np.float64)
         return _parse(text)
-    except (ValueError, KeyError, TypeError, EOFError, RecursionError, SyntaxError) as error:
+    except (ValueError, KeyError, TypeError, EOFError, RecursionError, MemoryError) as error:
         raise ValueError(
             f"a transform's file must hold 4x4 numbers; {path}: {error}. Write four rows of four."
         ) from error
@@ -52,8 +52,7 @@ def _decode(data: bytes) -> str:
 def _parse(text: str) -> np.ndarray:
     lines = [re.sub(r"(#|//).*", "", line).strip() for line in text.splitlines()]
     joined = "\n".join(line for line in lines if line)
-    if joined.startswith(("[", "(")) or "array(" in joined or "matrix(" in joined:
-        joined = re.sub(r"^\w+\s*=\s*|(np\.|numpy\.)?(array|matrix)\(|dtype=\S+", " ", joined)
+    joined = re.sub(r"^\w+\s*=|(np\.|numpy\.)?(array|matrix)\s*\(|dtype=[\w.]+", " ", joined)
     cells: list[list[float]] = [
         [float(cell) for cell in re.split(r"[\s,;\[\]()]+", line) if cell]
         for line in joined.splitlines()

@@ -10,7 +10,7 @@ import math
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -179,7 +179,7 @@ def _read(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     return _header(text, str(path)), arrays
 
 
-def _members(file: BinaryIO) -> dict[str, np.ndarray]:
+def _members(file: Any) -> dict[str, np.ndarray]:
     """The arrays of an archive as `numpy.savez` writes it: stored, none larger than its bytes.
 
     `numpy.load` would believe what the archive and its arrays say of their sizes, and a file of a
@@ -200,7 +200,7 @@ def _members(file: BinaryIO) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _array(stream: IO[bytes], size: int) -> np.ndarray:
+def _array(stream: Any, size: int) -> np.ndarray:
     """One array of numbers or text in NumPy's format, which must fill ``size`` bytes exactly."""
     version = np.lib.format.read_magic(stream)
     read_head = {(1, 0): "read_array_header_1_0", (2, 0): "read_array_header_2_0"}[version]

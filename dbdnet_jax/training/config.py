@@ -82,9 +82,7 @@ class OverlapConfig:
         """Refuse a stage of nothing."""
         _check_stage("overlap", self)
         if self.gamma < 0:
-            raise ValueError(
-                f"config.overlap.gamma must not be negative; got {self.gamma}. Use 4."
-            )
+            raise ValueError(f"config.overlap.gamma must not be negative; got {self.gamma}. Use 4.")
 
 
 @dataclasses.dataclass(frozen=True)

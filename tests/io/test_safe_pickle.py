@@ -116,7 +116,7 @@ def test_other_names_are_refused(tmp_path, name):
             b"(Vstorage\nVf4\nV0\nVcpu\nI-1\ntQ.",
             "size of a storage must be at most 32 whole numbers from 0",
         ),
-        (b"]" * 100000 + b"a" * 99999 + b".", "damaged"),
+        (b"]" * 100000 + b"a" * 99999 + b".", "at most 200 levels"),
     ],
 )
 def test_crafted_pickles_are_refused(tmp_path, data, message):
