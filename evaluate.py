@@ -25,7 +25,7 @@ from dbdnet_jax.evaluation.run import evaluate
 from dbdnet_jax.evaluation.sweep import SWEEP_PAIRS, SWEEPS, render_sweep, save_sweep, sweep
 from dbdnet_jax.evaluation.tables import render, save
 from dbdnet_jax.io.files import require_writable, write_atomic
-from dbdnet_jax.io.programs import keep_compiled_programs
+from dbdnet_jax.io.programs import keep_compiled_programs, require_device
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import PRETRAINED, load_named
 from dbdnet_jax.training.checkpoint import JOINT, STAGES, load_best
@@ -92,6 +92,7 @@ def main(argv: list[str]) -> None:
     run_dir = Path(RUN_DIR.value or Path("runs") / config_name)
     try:
         require_writable(run_dir)
+        require_device()
         if REPORT.value:
             require_drawing()
         config = read_config(CONFIG.value)

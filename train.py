@@ -21,7 +21,7 @@ from dbdnet_jax.data.test_pairs import load_test_pairs
 from dbdnet_jax.data.training_pairs import load_training_pairs
 from dbdnet_jax.evaluation.run import evaluate
 from dbdnet_jax.evaluation.tables import render, save
-from dbdnet_jax.io.programs import keep_compiled_programs
+from dbdnet_jax.io.programs import keep_compiled_programs, require_device
 from dbdnet_jax.networks.weights import save_params
 from dbdnet_jax.training.checkpoint import JOINT, STAGES, load_best
 from dbdnet_jax.training.config import parse_flags, read_config
@@ -51,6 +51,7 @@ def main(argv: list[str]) -> None:
         devices = config.train.devices or min(os.cpu_count() or 1, pairs)
         jax.config.update("jax_num_cpu_devices", devices)
         keep_compiled_programs()
+        require_device()
         for stage in stages:
             stream = load_training_pairs(
                 config.data,

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ from ml_collections import ConfigDict
 from configs import cad, cad_short, modelnet, threedmatch
 from dbdnet_jax.data.pairs import Protocol
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
-from dbdnet_jax.training.config import RunConfig, read_config, stage_record
+from dbdnet_jax.training.config import RunConfig, read_config, read_record, stage_record
 from dbdnet_jax.training.losses import LossWeights
 
 ROOT = Path(__file__).parents[1]
@@ -139,6 +140,33 @@ def test_a_wrong_configuration_is_refused(changes, message):
         read_config(with_change(**changes))
 
 
+def leaves(section: ConfigDict, *path: str) -> list[tuple[str, ...]]:
+    """The dotted names of all fields, as tuples."""
+    found = []
+    for name, value in section.items():
+        inside = isinstance(value, ConfigDict)
+        found += leaves(value, *path, name) if inside else [(*path, name)]
+    return found
+
+
+@pytest.mark.parametrize("path", leaves(cad.get_config()), ids=".".join)
+def test_every_field_refuses_what_is_no_number_and_other_types(path):
+    for value in (float("nan"), float("inf"), -float("inf"), 1e300, None, [1], {"a": 1}, b"x"):
+        config = cad.get_config().to_dict()
+        section = config
+        for name in path[:-1]:
+            section = section[name]
+        section[path[-1]] = value
+        with pytest.raises(ValueError, match=rf"{re.escape('.'.join(path))} must be .*; got"):
+            read_record(RunConfig, config, "config")
+
+
+@pytest.mark.parametrize("field", ["heads", "neighbours", "overlap_channels", "iterations"])
+def test_a_network_of_nothing_is_refused_by_its_field(field):
+    with pytest.raises(ValueError, match=rf"in config\.model: {field} must be from"):
+        read_config(with_change(**{f"model__{field}": 0}))
+
+
 def test_a_missing_field_is_named():
     config = with_change()
     with config.unlocked():
@@ -151,11 +179,20 @@ def test_a_missing_field_is_named():
     ("arguments", "message"),
     [
         (["--config=configs/cad.py", "--config.train.batchsize=4"], 'Did you mean "batch_size"'),
+        (["--config=configs/cad.py", "--config.model.heads=0"], "heads must be from 1"),
+        (["--config=configs/cad.py", "--config.train.learning_rate=nan"], "learning_rate must be"),
         (["--config=configs/nothing.py"], "there is none at configs/nothing.py"),
         (["--config=configs/modelnet.py", "--config.data.folder=/nowhere"], "none at /nowhere"),
         (["--config=configs/threedmatch.py"], "Give --config.data.folder=PATH"),
     ],
-    ids=["misspelt field", "no such configuration", "no such folder", "no folder given"],
+    ids=[
+        "misspelt field",
+        "no heads",
+        "no number",
+        "no such configuration",
+        "no such folder",
+        "no folder given",
+    ],
 )
 def test_the_script_says_in_one_line_what_is_wrong(arguments, message, tmp_path):
     done = train(*arguments, f"--run_dir={tmp_path / 'run'}")
