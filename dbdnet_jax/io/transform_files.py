@@ -45,8 +45,8 @@ def read_transform(path: Path) -> np.ndarray:
 
 def _decode(data: bytes) -> str:
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
-        return data.decode("utf-16")
-    return data.decode("utf-8-sig", errors="replace")
+        return data.decode("utf-16").lstrip("\ufeff")
+    return data.decode("utf-8", errors="replace").lstrip("\ufeff")
 
 
 def _parse(text: str) -> np.ndarray:

@@ -44,9 +44,7 @@ def test_utf16_is_read(folder):
     assert read_pairs(folder / "list.txt")[0].source == folder / "a.ply"
 
 
-@pytest.mark.parametrize(
-    "line", ["a.ply", "a.ply b.ply a.ply", "'a.ply b.ply", "\x00\x01", ",", "'' a"]
-)
+@pytest.mark.parametrize("line", ["a.ply", "a.ply b.ply a.ply", "'a.ply b.ply", "\x00\x01", ","])
 def test_another_line_is_named_with_file_and_line(folder, line):
     (folder / "list.txt").write_text(f"a.ply b.ply\n\n{line}\n")
     with pytest.raises(ValueError, match=r"list\.txt:3 must hold two paths; got"):

@@ -1,5 +1,8 @@
 """Clouds of any size go through a few compiled programs."""
 
+import os
+import subprocess
+import sys
 import zlib
 from pathlib import Path
 
@@ -19,6 +22,7 @@ from tests.conftest import random_cloud
 from tests.test_structure import imported_names
 
 NOT_TRACED = {"programs", "files", "forks", "quality", "errors"}
+EXAMPLES = Path(__file__).parents[2] / "examples"
 BUCKETS = {192, 384, 768, 1536}
 
 
@@ -93,9 +97,17 @@ def test_two_functions_of_equal_arguments_are_two_programs(monkeypatch):
 
 
 @pytest.fixture
-def kept(tmp_path, monkeypatch):
+def keep_in():
+    """Tell JAX of another folder for programs, for one test."""
+    before = jax.config.values["jax_compilation_cache_dir"]
+    yield lambda folder: jax.config.update("jax_compilation_cache_dir", folder)
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+@pytest.fixture
+def kept(tmp_path, keep_in):
     """A folder where programs are kept, and how often one was traced."""
-    monkeypatch.setitem(jax.config.values, "jax_compilation_cache_dir", str(tmp_path))
+    keep_in(str(tmp_path))
     traced = []
 
     def double(x):
@@ -133,7 +145,7 @@ def test_a_damaged_program_is_made_again(kept, where):
         assert run() == times  # kept again
 
 
-def test_a_folder_in_place_of_a_program_and_a_full_disk_cost_a_warning(kept, monkeypatch):
+def test_a_folder_in_place_of_a_program_and_a_full_disk_cost_a_warning(kept, keep_in):
     folder, run = kept
     run()
     path = entry(folder)
@@ -142,7 +154,8 @@ def test_a_folder_in_place_of_a_program_and_a_full_disk_cost_a_warning(kept, mon
     warn_without_cache.cache_clear()
     with pytest.warns(RuntimeWarning, match="nothing is kept for the next run"):
         assert run() == 2
-    monkeypatch.setitem(jax.config.values, "jax_compilation_cache_dir", "/dev/null/below")
+    keep_in("/dev/null/below")
+    warn_without_cache.cache_clear()
     with pytest.warns(RuntimeWarning, match="nothing is kept"):
         assert run() == 3
 
@@ -175,12 +188,23 @@ def test_entries_of_jax_that_are_not_whole_are_deleted(tmp_path):
 
 
 @pytest.mark.parametrize("given", [None, "/dev/null/below"])
-def test_no_folder_for_programs_is_said_and_none_is_used(given, monkeypatch):
-    monkeypatch.setitem(jax.config.values, "jax_compilation_cache_dir", given)
+def test_no_folder_for_programs_is_said_and_none_is_used(given, keep_in, monkeypatch):
+    keep_in(given)
     monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
-    updates = {}
-    monkeypatch.setattr(jax.config, "update", updates.__setitem__)
+    shortest = jax.config.values["jax_persistent_cache_min_compile_time_secs"]
     warn_without_cache.cache_clear()
     with pytest.warns(RuntimeWarning, match="nothing is kept for the next run"):
         programs.keep_compiled_programs()
-    assert updates["jax_compilation_cache_dir"] is None
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", shortest)
+    assert jax.config.values["jax_compilation_cache_dir"] is None
+
+
+def test_a_platform_that_is_not_there_is_one_line():
+    done = subprocess.run(
+        [sys.executable, "-m", "dbdnet_jax", *map(str, EXAMPLES.glob("*.ply"))],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"JAX_PLATFORMS": "cuda"},
+    )
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert "error: JAX_PLATFORMS must name platforms that this machine has; got" in done.stderr

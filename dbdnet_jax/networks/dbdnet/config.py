@@ -65,7 +65,7 @@ class ModelConfig:
           ValueError: names the field, the rule and the value.
         """
         for field in fields(self):
-            _check_type(field.name, getattr(self, field.name), type(field.default))
+            check_field(field.name, getattr(self, field.name), type(field.default))
         if self.neighbour_space not in ("feature", "coordinates"):
             raise ValueError(
                 "neighbour_space must be 'feature' or 'coordinates'; "
@@ -138,7 +138,7 @@ class ModelConfig:
         return (width // 2, 16), (width // 4, 16), (width // 8, 8)
 
 
-def _check_type(name: str, value: object, kind: type) -> None:
+def check_field(name: str, value: object, kind: type) -> None:
     """Refuse a value of another type than its field's, and a number out of bounds, NaN included."""
     accepted = (int, float) if kind is float else kind
     if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
