@@ -9,9 +9,9 @@ DATA_SETS = ("cad", "modelnet40", "threedmatch")
 class DataConfig:
     """Which shapes or scans: ``folder`` is where the downloaded sets stand ("" for "cad")."""
 
-    name: str
-    folder: str
-    categories: str  # "all", or one half of the shape classes: "seen" or "unseen"
+    name: str = "cad"
+    folder: str = ""
+    categories: str = "all"  # "all", or one half of the shape classes: "seen" or "unseen"
     procedural: int = 0  # generated shapes to train on beside those of "cad": 15 ms each
     augment: float = 0.0  # share of the training pairs under other conditions than the protocol's
 

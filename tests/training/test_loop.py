@@ -14,10 +14,10 @@ import optax
 import pytest
 
 from dbdnet_jax.training.checkpoint import Checkpoints
-from dbdnet_jax.training.loop import init_state, train_step
 from dbdnet_jax.training.optimizer import make_optimizer, make_schedule
 from dbdnet_jax.training.parallel import mean_over_pairs, on_all_devices
 from dbdnet_jax.training.runlog import RunLog
+from dbdnet_jax.training.step import init_state, train_step
 from tests import stand_in
 from tests.conftest import EXACT, FLOAT32, assert_close, assert_finite
 

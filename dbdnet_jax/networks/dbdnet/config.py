@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-Layers = tuple[tuple[int, int], ...]  # (features, groups of the norm) of each layer
+from dbdnet_jax.networks.blocks import Layers
 
 
 @dataclass(frozen=True)

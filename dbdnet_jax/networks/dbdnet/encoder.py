@@ -5,8 +5,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dbdnet_jax.networks.blocks import Exchange
-from dbdnet_jax.networks.edgeconv import EdgeConv
+from dbdnet_jax.networks.blocks import Exchange, exchange_shapes
+from dbdnet_jax.networks.edgeconv import EdgeConv, edgeconv_shapes
+from dbdnet_jax.networks.params import Shapes
 from dbdnet_jax.ops.grouping import knn
 from dbdnet_jax.ops.pyramid import LEVELS, Pyramid, query_down
 
@@ -81,3 +82,25 @@ class Encoder(nn.Module):
                     parts.append(move.down(query_down(x, pyramid, other, level)))
             result.append(sum(parts[1:], parts[0]))
         return result
+
+
+def encoder_shapes(name: str, channels: int) -> Shapes:
+    """The parameters of an `Encoder`."""
+    widths = [channels << level for level in range(LEVELS)]
+    shapes: Shapes = {}
+    for stage in range(1, LEVELS + 1):
+        for level, width in enumerate(widths[:stage]):
+            fan_in = width if stage > 1 else 3
+            shapes |= edgeconv_shapes(f"{name}/stage{stage}_conv{level + 1}", fan_in, width)
+        for level, width in enumerate(widths[: stage + 1]):
+            for other, fan_in in enumerate(widths[:stage]):
+                if other != level:
+                    move = f"{'up' if other > level else 'down'}_{other + 1}_{level + 1}"
+                    shapes |= exchange_shapes(f"{name}/stage{stage}_{move}", fan_in, width)
+    for level, width in enumerate(widths):
+        # What is fused: the level's output of every stage that holds it and the last exchange's.
+        fused = (LEVELS + 1 - level) * width
+        shapes |= exchange_shapes(f"{name}/fusion_{level + 1}", fused, width)
+        if level:
+            shapes |= exchange_shapes(f"{name}/neck_{level + 1}", width, channels)
+    return shapes

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float, Int
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.ops import rigid
 from dbdnet_jax.ops.rigid import HIGHEST
-from dbdnet_jax.ops.sampling import farthest_order, inverse_order, prefix_mask, prefix_order
+from dbdnet_jax.ops.sampling import farthest_order, inverse_order, prefix_order
 from dbdnet_jax.types import Cloud, Rigid
 
 
@@ -46,8 +46,7 @@ def centre_and_order(clouds: Cloud, config: ModelConfig, limit: int):
     Returns the clouds, the order, the released code's rows for query-down, and the centroids.
     What stands in the padding is overwritten, so that it cannot matter from here on.
     """
-    size = clouds.points.shape[1]
-    valid = jax.vmap(lambda count: prefix_mask(size, count))(clouds.count)[..., None]
+    valid = clouds.valid[..., None]
     points = jnp.where(valid, clouds.points, 0.0)
     centroid = jnp.sum(points, axis=1) / jnp.maximum(clouds.count, 1)[:, None]
     if config.released:

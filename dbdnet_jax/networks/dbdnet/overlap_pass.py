@@ -19,7 +19,7 @@ from dbdnet_jax.networks.params import Params
 from dbdnet_jax.ops import rigid
 from dbdnet_jax.ops.grouping import interpolate, interpolation_weights
 from dbdnet_jax.ops.pyramid import Pyramid, build_pyramids
-from dbdnet_jax.ops.sampling import inverse_order, prefix_mask
+from dbdnet_jax.ops.sampling import inverse_order
 from dbdnet_jax.types import Cloud, Rigid
 
 
@@ -66,9 +66,7 @@ def apply_overlap_network(
 
 def probability_of_all(prepared: PreparedPair, logits: Float[Array, "2 n"]) -> Float[Array, "2 m"]:
     """Overlap probability of all points, in the clouds' own row order; zero in the padding."""
-    size = prepared.ordered.points.shape[1]
     if prepared.nearest is not None:
         logits = jax.vmap(interpolate)(logits[..., None], *prepared.nearest)[..., 0]
-    valid = jax.vmap(lambda count: prefix_mask(size, count))(prepared.ordered.count)
     logits = jnp.take_along_axis(logits, jax.vmap(inverse_order)(prepared.order), axis=1)
-    return jnp.where(valid, jax.nn.sigmoid(logits), 0.0)
+    return jnp.where(prepared.ordered.valid, jax.nn.sigmoid(logits), 0.0)

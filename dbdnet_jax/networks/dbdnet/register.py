@@ -65,7 +65,7 @@ def register(
         logits, _ = apply_overlap_network(params, prepared, motion)
         moved = move_source(level, motion)
         answer = _register(params, moved, order, probability_of_all(prepared, logits), sizes)
-        motion = rigid.compose(Rigid(answer.rotation, answer.translation), motion)
+        motion = rigid.compose(answer.motion, motion)
         return motion, (motion, answer)
 
     _, answers = jax.lax.scan(pass_and_register, start, length=params.config.overlap_passes)
@@ -86,8 +86,7 @@ def register(
 
 def register_clouds(params: Params, source: Cloud, target: Cloud) -> Registration:
     """`register` of two clouds whose points are their first rows."""
-    masks = (prefix_mask(len(cloud.points), cloud.count) for cloud in (source, target))
-    return register(params, source.points, target.points, *masks)
+    return register(params, source.points, target.points, source.valid, target.valid)
 
 
 def predict_overlap(
@@ -263,7 +262,7 @@ def _solve(
         # Departure: not divided by the row's mass, so slack pulls points to the origin, and every
         # kept row weighs the same.
         soft = jnp.matmul(matrix, target, precision=HIGHEST)
-        valid = prefix_mask(source.shape[0], ordered.count[0]).astype(source.dtype)
+        valid = ordered.valid[0].astype(source.dtype)
         weights = jnp.broadcast_to(valid, matrix.shape[:2])
     else:
         soft, weights = jax.vmap(soft_targets, in_axes=(0, None))(matrix, target)
