@@ -86,6 +86,7 @@ def _model() -> ConfigDict:
             "overlap_passes": 1,
             "overlap_points": 0,  # 0: all
             "registration_points": 0,
+            "local_geometry": 0,  # radii at which the surface around a point is seen
             "overlap_threshold": 0.5,
             "min_points": 160,
             "iterations": 1,
@@ -112,5 +113,6 @@ def _train() -> ConfigDict:
             "checkpoint_every": 200,
             "validation_pairs": 200,
             "devices": 0,  # on a CPU; 0: one for each core
+            "decay_epochs": 0.0,  # 0: a cosine over all epochs
         }
     )

@@ -5,12 +5,23 @@ from collections.abc import Sequence
 import optax
 
 
-def make_schedule(peak: float, steps: int, warmup_steps: int) -> optax.Schedule:
-    """Linear warm-up to ``peak``, then a cosine that ends at 0 after ``steps``."""
-    warmup_steps = min(warmup_steps, steps - 1)
+def make_schedule(
+    peak: float, steps: int, warmup_steps: int, decay_steps: int = 0
+) -> optax.Schedule:
+    """Linear warm-up to ``peak``, then a cosine that ends at 0 after ``steps``.
+
+    With ``decay_steps`` the rate stays at ``peak`` until the last of so many steps, over which the
+    cosine goes: more steps then change nothing of those before.
+    """
+    warmup_steps = max(min(warmup_steps, steps - 1), 0)
+    first = peak / (warmup_steps + 1)  # not 0: the first step counts too
+    if 0 < decay_steps < steps - warmup_steps:
+        rising = optax.linear_schedule(first, peak, max(warmup_steps, 1))
+        falling = optax.cosine_decay_schedule(peak, decay_steps)
+        ends = [warmup_steps, steps - decay_steps]
+        return optax.join_schedules([rising, optax.constant_schedule(peak), falling], ends)
     if warmup_steps < 1:
         return optax.cosine_decay_schedule(peak, max(steps, 1))
-    first = peak / (warmup_steps + 1)  # not 0: the first step counts too
     return optax.warmup_cosine_decay_schedule(first, peak, warmup_steps, steps)
 
 

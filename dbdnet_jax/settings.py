@@ -70,6 +70,7 @@ class TrainSettings:
     checkpoint_every: int
     validation_pairs: int
     devices: int  # XLA devices on a CPU; 0: one for each core
+    decay_epochs: float = 0.0  # at the end, the rate constant before them; 0: a cosine over all
 
     def __post_init__(self):
         """Refuse cadences that do not fit each other: a resumed log must equal an unbroken one."""
@@ -193,8 +194,13 @@ def read_record(record: type, section: Mapping[str, Any], where: str) -> Any:
 
 
 def stage_record(settings: Settings, stage: str) -> dict[str, Any]:
-    """What decides the outcome of a stage, as plain JSON values: a run may resume only with it."""
+    """What decides the outcome of a stage, as plain JSON values: a run may resume only with it.
+
+    Where the rate is constant but for the last epochs, a run may be prolonged or cut short.
+    """
     record = dataclasses.asdict(settings)
+    if settings.train.decay_epochs:
+        del record[stage]["epochs"]
     for name in ("devices", "batch_size", "learning_rate"):  # the stage holds the last two
         del record["train"][name]
     parts = ("overlap", "registration", "joint") if stage == "joint" else (stage,)

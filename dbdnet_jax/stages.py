@@ -26,6 +26,7 @@ from dbdnet_jax.model.dbdnet import (
     register_clouds,
     register_given_overlap,
 )
+from dbdnet_jax.model.growing import with_local_geometry
 from dbdnet_jax.model.params import (
     Params,
     flatten,
@@ -91,13 +92,18 @@ def _first_params(settings: Settings) -> Params:
 
 
 def _start_params(settings: Settings) -> Params:
-    """The networks in ``config.train.start``: one or both, of the configuration's widths."""
+    """The networks in ``config.train.start``: one or both, of the configuration's widths.
+
+    Weights without local geometry, or with less of it, are given the rest (zeros at first).
+    """
     if not Path(settings.train.start).is_file():
         raise FileNotFoundError(
             "config.train.start must be a file of weights; there is none at "
             f"{settings.train.start}. Give its path, or '' to start from fresh weights."
         )
     start = load_params(settings.train.start)
+    if start.config.local_geometry < settings.model.local_geometry:
+        start = with_local_geometry(start, settings.model.local_geometry)
     held = [name for name in STAGES if getattr(start, name) is not None]
     require_shapes(
         {name: array.shape for name, array in flatten(start).items()},

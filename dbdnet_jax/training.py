@@ -143,7 +143,12 @@ def run_task(
     """`fit` for any task."""
     epoch_steps = max(1, source.epoch_pairs // batch_size)
     total = max(1, round(epochs * epoch_steps))
-    schedule = make_schedule(learning_rate, total, round(train.warmup_epochs * epoch_steps))
+    schedule = make_schedule(
+        learning_rate,
+        total,
+        round(train.warmup_epochs * epoch_steps),
+        round(train.decay_epochs * epoch_steps),
+    )
     optimizer = make_optimizer(
         schedule,
         weight_decay=train.weight_decay,

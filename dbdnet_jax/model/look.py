@@ -10,7 +10,14 @@ from dbdnet_jax.model.config import ModelConfig
 from dbdnet_jax.model.matching import Matched
 from dbdnet_jax.model.overlap import OverlapNetwork
 from dbdnet_jax.model.params import Params
-from dbdnet_jax.model.stack import first_rows, move_source, prepare, uncentred
+from dbdnet_jax.model.stack import (
+    first_rows,
+    geometry_of,
+    move_source,
+    prepare,
+    reordered,
+    uncentred,
+)
 from dbdnet_jax.ops import rigid
 from dbdnet_jax.ops.grouping import interpolate, interpolation_weights
 from dbdnet_jax.ops.pyramid import Pyramid, build_pyramids
@@ -27,6 +34,7 @@ class View(NamedTuple):
     order: Int[Array, "2 n"]
     ordered: Cloud  # all points in that order
     nearest: tuple[Array, Array] | None  # of all points among the seen ones, to interpolate
+    geometry: Float[Array, "2 m g"] | None  # of all points, in the clouds' own row order
 
 
 def view_of(config: ModelConfig, clouds: Cloud) -> View:
@@ -37,7 +45,7 @@ def view_of(config: ModelConfig, clouds: Cloud) -> View:
     nearest = None
     if seen.points.shape[1] < ordered.points.shape[1]:
         nearest = jax.vmap(interpolation_weights)(ordered.points, seen.points, seen.count)
-    return View(seen, centroid, pyramids, order, ordered, nearest)
+    return View(seen, centroid, pyramids, order, ordered, nearest, geometry_of(clouds, config))
 
 
 def look(
@@ -50,7 +58,9 @@ def look(
     network = OverlapNetwork(params.config)
     moved = move_source(view.seen, start)
     variables = {"params": params.overlap}
-    answer: Any = network.apply(variables, moved, view.pyramids, dropout_key)
+    rows = view.order[:, : moved.points.shape[1]]
+    geometry = reordered(view.geometry, rows)
+    answer: Any = network.apply(variables, moved, view.pyramids, dropout_key, geometry)
     logits, matched = answer
     if matched is not None:
         own = view.seen._replace(points=view.seen.points + view.centroid[:, None, :])

@@ -23,7 +23,11 @@ class OverlapNetwork(nn.Module):
 
     @nn.compact
     def __call__(
-        self, clouds: Cloud, pyramids: Pyramid, dropout_key: PRNGKeyArray | None = None
+        self,
+        clouds: Cloud,
+        pyramids: Pyramid,
+        dropout_key: PRNGKeyArray | None = None,
+        geometry: Float[Array, "2 n g"] | None = None,
     ) -> tuple[Float[Array, "2 n"], Matched | None]:
         """Logits of the points of two clouds, stacked, each in farthest-point order.
 
@@ -33,7 +37,7 @@ class OverlapNetwork(nn.Module):
         """
         config = self.config
         encoder = Encoder(config.overlap_channels, config.neighbour_space, name="encoder")
-        features = over_clouds(encoder, clouds.points, pyramids)
+        features = over_clouds(encoder, clouds.points, pyramids, geometry)
         n, width = features.shape[1:]
         features = features + jax.vmap(lambda x: position_code(x, width))(clouds.points)
         valid = jax.vmap(lambda count: prefix_mask(n, count))(clouds.count)

@@ -80,7 +80,7 @@ def parameter_shapes(config: ModelConfig, networks: Collection[str] = NETWORKS) 
     shapes: Shapes = {}
     if "overlap" in networks:
         width = 4 * config.overlap_channels
-        _encoder(shapes, "overlap/encoder", config.overlap_channels)
+        _encoder(shapes, "overlap/encoder", config.overlap_channels, config.inputs)
         _blocks(shapes, "overlap/attention", config.overlap_blocks, width)
         fan_in = 2 * width
         if config.overlap_matching:
@@ -90,7 +90,7 @@ def parameter_shapes(config: ModelConfig, networks: Collection[str] = NETWORKS) 
         _affine(shapes, "overlap/linear", last, 1)
     if "registration" in networks:
         width = 4 * config.registration_channels
-        _encoder(shapes, "registration/encoder", config.registration_channels)
+        _encoder(shapes, "registration/encoder", config.registration_channels, config.inputs)
         _blocks(shapes, "registration/attention", config.shared_blocks, width)
         _blocks(shapes, "registration/attention_R", config.rotation_blocks, width)
         _blocks(shapes, "registration/attention_t", config.translation_blocks, width)
@@ -162,12 +162,12 @@ def _blocks(shapes: Shapes, stem: str, count: int, width: int) -> None:
             _norm(shapes, f"{stem}_{block}/{step}_layer_norm", width)
 
 
-def _encoder(shapes: Shapes, name: str, channels: int) -> None:
+def _encoder(shapes: Shapes, name: str, channels: int, inputs: int) -> None:
     widths = [channels << level for level in range(LEVELS)]
     for stage in range(1, LEVELS + 1):
         for level, width in enumerate(widths[:stage]):
             conv = f"{name}/stage{stage}_conv{level + 1}"
-            for layer, fan_in in enumerate((2 * width if stage > 1 else 2 * 3, width)):
+            for layer, fan_in in enumerate((2 * width if stage > 1 else 2 * inputs, width)):
                 _affine(shapes, f"{conv}/conv_{layer}", fan_in, width)
                 _norm(shapes, f"{conv}/norm_{layer}", width)
         for level, width in enumerate(widths[: stage + 1]):
