@@ -19,7 +19,21 @@ def get_config() -> ConfigDict:
     config = ConfigDict()
     config.model = _model()
     config.data = ConfigDict(
-        {"name": "modelnet40", "folder": "", "categories": "all", "procedural": 0, "varied": 0.0}
+        {
+            "name": "modelnet40",
+            "folder": "",
+            "categories": "all",
+            "procedural": 0,
+            "varied": 0.0,
+            "mixture": {
+                "low_overlap": 0.0,
+                "views": 0.0,
+                "standing": 0.0,
+                "cluttered": 0.0,
+                "rooms": 0.0,
+                "turned": 0.0,
+            },
+        }
     )
     config.protocol = ConfigDict(
         {

@@ -11,6 +11,7 @@ from typing import Any
 
 from ml_collections import ConfigDict
 
+from dbdnet_jax.data.mixture import Mixture
 from dbdnet_jax.data.pairs import Protocol
 from dbdnet_jax.losses import LossWeights
 from dbdnet_jax.model.config import ModelConfig
@@ -30,6 +31,7 @@ class DataSettings:
         0  # generated shapes to train on beside those of "cad": 15 ms each, every start
     )
     varied: float = 0.0  # share of the training pairs under other conditions than the protocol's
+    mixture: Mixture = Mixture()  # shares of pairs as the world is; ``varied`` is of the others
 
     def __post_init__(self):
         """Refuse an unknown data set."""
@@ -46,6 +48,11 @@ class DataSettings:
             raise ValueError(
                 "config.data.varied must be in [0, 1], and 0 for 'threedmatch', whose pairs are "
                 f"read; got {self.varied} for {self.name!r}. Use 0."
+            )
+        if self.mixture.total and self.name == "threedmatch":
+            raise ValueError(
+                "config.data.mixture must be 0 for 'threedmatch', whose pairs are read; got "
+                f"{self.mixture}. Set its shares to 0."
             )
 
 

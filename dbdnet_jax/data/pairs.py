@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from dbdnet_jax.ops import rigid
 from dbdnet_jax.ops.grouping import squared_distances
-from dbdnet_jax.ops.sampling import half_space_crop, random_direction, resample
+from dbdnet_jax.ops.sampling import half_space_crop, prefix_mask, random_direction, resample
 from dbdnet_jax.types import Cloud, Pair, Rigid
 
 
@@ -143,13 +143,12 @@ def imperfect_motion(
     """The true motion, then a turn about the source's centroid and a shift.
 
     Both grow with one uniform number, up to the angle and the shift's deviation per component.
-    Clouds without padding only.
     """
     amount_key, direction_key = jax.random.split(key)
     amount = jax.random.uniform(amount_key)
     axis, shift = jax.random.normal(direction_key, (2, 3))
     turn = rigid.rotation_about(axis / jnp.linalg.norm(axis), amount * math.radians(max_angle_deg))
-    centre = jnp.mean(rigid.apply(pair.target_from_source, pair.source.points), axis=0)
+    centre = rigid.apply(pair.target_from_source, _centroid(pair.source)[None, :])[0]
     shift = centre - turn @ centre + amount * shift_sigma * shift
     return rigid.compose(Rigid(turn, shift), pair.target_from_source)
 
@@ -161,7 +160,7 @@ def starting_motion(key: PRNGKeyArray, pair: Pair) -> Rigid:
     """
     choice_key, motion_key = jax.random.split(key)
     roughly = imperfect_motion(motion_key, pair, max_angle_deg=40.0, shift_sigma=0.2)
-    shift = jnp.mean(pair.target.points, axis=0) - jnp.mean(pair.source.points, axis=0)
+    shift = _centroid(pair.target) - _centroid(pair.source)
     blind = jax.random.uniform(choice_key) < 0.4
     return jax.tree.map(
         lambda a, b: jnp.where(blind, a, b), Rigid(jnp.eye(3, dtype=shift.dtype), shift), roughly
@@ -194,6 +193,11 @@ def moved_pair(pair: Pair, motion: Rigid) -> Pair:
     source = pair.source._replace(points=rigid.apply(motion, pair.source.points))
     rest = rigid.compose(pair.target_from_source, rigid.invert(motion))
     return pair._replace(source=source, target_from_source=rest)
+
+
+def _centroid(cloud: Cloud) -> Float[Array, "3"]:
+    valid = prefix_mask(len(cloud.points), cloud.count)[:, None]
+    return jnp.sum(jnp.where(valid, cloud.points, 0.0), axis=0) / jnp.maximum(cloud.count, 1)
 
 
 def _overlap_labels(
