@@ -108,7 +108,10 @@ def read_record(record: type, section: Mapping[str, Any], where: str) -> Any:
 
 
 def stage_record(config: RunConfig, stage: str) -> dict[str, Any]:
-    """What decides the outcome of a stage, as plain JSON values: a run may resume only with it."""
+    """What decides the outcome of a stage, as plain JSON values: a run may resume only with it.
+
+    Where the rate is constant but for the last epochs, a run may be prolonged or cut short.
+    """
     stages = (*STAGES[config.method][stage].reads, stage)
     record = {
         name: dataclasses.asdict(section)
@@ -120,6 +123,8 @@ def stage_record(config: RunConfig, stage: str) -> dict[str, Any]:
             *((name, config.stages[name]) for name in stages),
         )
     }
+    if config.train.schedule == "constant":
+        del record[stage]["epochs"]
     for name in ("devices", "batch_size", "learning_rate"):  # the stage holds the last two
         del record["train"][name]
     return record if config.method == DEFAULT_METHOD else {"method": config.method, **record}

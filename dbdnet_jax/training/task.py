@@ -53,7 +53,8 @@ class TrainConfig:
     start from ("": fresh ones). ``batch_size`` and ``learning_rate`` are what the stages' own
     fields follow until set. ``optimizer`` "adam" adds the weight decay to the gradient, as torch's
     Adam does, "adamw" does not. ``schedule`` "cosine" ends at 0; "steps" multiplies the rate by
-    ``factor`` after each of the ``milestones`` (epochs); either, and "constant", may warm up.
+    ``factor`` after each of the ``milestones`` (epochs); "constant" falls to 0 by a cosine over the
+    last ``decay_epochs`` only, so that such a run may be prolonged or cut short. All may warm up.
     """
 
     seed: int = 0
@@ -65,6 +66,7 @@ class TrainConfig:
     schedule: str = "cosine"
     milestones: tuple[float, ...] = ()
     factor: float = 0.1
+    decay_epochs: float = 0.0
     warmup_epochs: float = 5.0
     clip_norm: float = 0.0  # global norm of a network's gradient
     ema_decay: float = 0.0  # of the moving average of the weights, which then is what is kept
@@ -86,6 +88,11 @@ class TrainConfig:
             raise ValueError(
                 "config.train.milestones must be given for schedule='steps', and for it alone; got "
                 f"{self.milestones} for {self.schedule!r}. Change one of the two."
+            )
+        if self.decay_epochs and self.schedule != "constant":
+            raise ValueError(
+                "config.train.decay_epochs must be 0 but for schedule='constant'; got "
+                f"{self.decay_epochs} for {self.schedule!r}. Change one of the two."
             )
         for name in ("log_every", "validate_every", "checkpoint_every", "validation_pairs"):
             value = getattr(self, name)

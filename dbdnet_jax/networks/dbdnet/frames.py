@@ -6,6 +6,7 @@ from jaxtyping import Array, Float, Int
 
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.ops import rigid
+from dbdnet_jax.ops.local_geometry import local_geometry
 from dbdnet_jax.ops.rigid import HIGHEST
 from dbdnet_jax.ops.sampling import farthest_order, inverse_order, prefix_order
 from dbdnet_jax.types import Cloud, Rigid
@@ -36,6 +37,27 @@ def stack_masked(src, tgt, src_mask, tgt_mask) -> tuple[Cloud, Int[Array, "2 n"]
     source, target = (Cloud(x, jnp.asarray(x.shape[0])) for x in (src, tgt))
     points = jnp.take_along_axis(stack_clouds(source, target).points, order[..., None], axis=1)
     return Cloud(points, jnp.sum(keep, axis=1)), order
+
+
+def geometry_of(clouds: Cloud, config: ModelConfig) -> Float[Array, "2 n g"] | None:
+    """`ops.local_geometry` of both clouds, from all of their points; None where none is seen.
+
+    No rigid motion changes it: found once, it serves every turn and every start.
+    """
+    if not config.local_geometry:
+        return None
+    return jax.lax.map(
+        lambda one: local_geometry(one.points, one.count, config.local_geometry), clouds
+    )
+
+
+def reordered(
+    geometry: Float[Array, "2 n g"] | None, order: Int[Array, "2 m"]
+) -> Float[Array, "2 m g"] | None:
+    """The rows of ``geometry`` that ``order`` names for each cloud."""
+    if geometry is None:
+        return None
+    return jnp.take_along_axis(geometry, order[..., None], axis=1)
 
 
 def centre_and_order(clouds: Cloud, config: ModelConfig, limit: int):

@@ -36,6 +36,7 @@ _FIXED = {
         "overlap_passes",
         "overlap_points",
         "registration_points",
+        "local_geometry",
     )
 }
 _FIX = "Give a checkpoint that the released code saved, unaltered."
