@@ -17,29 +17,18 @@ import numpy as np
 from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.io.files import write_atomic
 from dbdnet_jax.io.forks import require_own_jax
-from dbdnet_jax.networks.dbdnet.config import ModelConfig
-from dbdnet_jax.networks.dbdnet.register import Params
-from dbdnet_jax.networks.dbdnet.released import from_released, to_released
 from dbdnet_jax.networks.params import (
+    Params,
     flatten,
-    parameter_shapes,
     require_finite,
     require_shapes,
     unflatten,
 )
-
-__all__ = [
-    "CheckpointError",
-    "from_released",
-    "load_metadata",
-    "load_params",
-    "load_pretrained",
-    "save_params",
-    "to_released",
-]
+from dbdnet_jax.networks.table import DEFAULT_METHOD, LEARNED, method_of, parameter_shapes
 
 PRETRAINED = Path(__file__).parent / "pretrained"
 _FORMAT = 1
+_WIDEST = 65_536  # features of a layer; the widest known have 1,024
 _MOST_MEMBERS = 20_000  # the largest network that a configuration may ask for has 6,000
 _HEADER, _CHECKSUM = "header", "sha256"
 
@@ -53,7 +42,7 @@ def save_params(
 
     Args:
       path: the file; its folder must exist. An existing file is replaced.
-      params: the parameters; a network that is None is left out.
+      params: the parameters of any method, all of its networks or some.
       metadata: anything JSON can hold, for people: origin, data, figures.
 
     Raises:
@@ -63,14 +52,15 @@ def save_params(
     """
     arrays = flatten(params)
     _check(arrays, params.config, "params")
-    header = json.dumps(
-        {
-            "format": _FORMAT,
-            "model": dataclasses.asdict(params.config),
-            "metadata": dict(metadata or {}),
-        },
-        sort_keys=True,
-    )
+    content = {
+        "format": _FORMAT,
+        "model": dataclasses.asdict(params.config),
+        "metadata": dict(metadata or {}),
+    }
+    method = method_of(params.config)
+    if method != DEFAULT_METHOD:
+        content["method"] = method
+    header = json.dumps(content, sort_keys=True)
     path = Path(path)
     if not path.parent.is_dir():
         raise FileNotFoundError(
@@ -93,20 +83,43 @@ def load_params(path: str | Path) -> Params:
     """
     require_own_jax("load_params")
     header, arrays = _read(path)
-    fields = {field.name for field in dataclasses.fields(ModelConfig)}
-    unknown = sorted(set(header["model"]) - fields)
-    if unknown:
-        raise CheckpointError(
-            f"{path}: every field of the configuration must be known; {', '.join(unknown)} "
-            "is not. Update dbdnet_jax: a newer release wrote the file."
-        )
-    try:
-        config = ModelConfig(**header["model"])
-    except (TypeError, ValueError) as error:
-        raise CheckpointError(f"{path}: the configuration cannot be built: {error}") from error
+    method = header.get("method", DEFAULT_METHOD)
+    config = read_model(method, header["model"], str(path))
     _check(arrays, config, str(path))
     native = {name: x.astype(x.dtype.newbyteorder("="), copy=False) for name, x in arrays.items()}
     return unflatten(native, config)
+
+
+def read_model(method: str, fields: Mapping[str, Any], owner: str) -> Any:
+    """The configuration of a method's network from its fields, as JSON holds them.
+
+    Raises:
+      CheckpointError: a method or a field that this release does not know, or a value it refuses.
+    """
+    if not isinstance(method, str) or method not in LEARNED:
+        raise CheckpointError(
+            f"{owner}: the method must be one of {', '.join(LEARNED)}; got {method!r}. Update "
+            "dbdnet_jax: a newer release wrote the file."
+        )
+    record = LEARNED[method].config
+    unknown = sorted(set(fields) - {field.name for field in dataclasses.fields(record)})
+    if unknown:
+        raise CheckpointError(
+            f"{owner}: every field of the configuration must be known; {', '.join(unknown)} "
+            "is not. Update dbdnet_jax: a newer release wrote the file."
+        )
+    for name, value in fields.items():
+        for width in value if isinstance(value, list) else ():
+            if type(width) is not int or not 1 <= width <= _WIDEST:
+                raise CheckpointError(
+                    f"{owner}: the configuration cannot be built: {name} must hold whole numbers "
+                    f"from 1 to {_WIDEST}; got {width!r:.60}. Save it again with save_params."
+                )
+    try:
+        # JSON has no tuples; a configuration must be hashable.
+        return record(**{k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()})
+    except (TypeError, ValueError, ArithmeticError) as error:
+        raise CheckpointError(f"{owner}: the configuration cannot be built: {error}") from error
 
 
 def load_metadata(path: str | Path) -> dict[str, Any]:
@@ -233,7 +246,7 @@ def _header(text: str, path: str) -> dict[str, Any]:
     return header
 
 
-def _check(arrays: Mapping[str, np.ndarray], config: ModelConfig, owner: str) -> None:
+def _check(arrays: Mapping[str, np.ndarray], config: Any, owner: str) -> None:
     """Refuse arrays that are not the parameters of the networks they name."""
     expected = parameter_shapes(config, {name.split("/")[0] for name in arrays})
     require_shapes(

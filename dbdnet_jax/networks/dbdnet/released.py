@@ -16,12 +16,12 @@ import numpy as np
 from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.io.torch_pickle import load_torch
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
-from dbdnet_jax.networks.dbdnet.register import Params
+from dbdnet_jax.networks.dbdnet.overlap import overlap_shapes
+from dbdnet_jax.networks.dbdnet.registration import registration_shapes
 from dbdnet_jax.networks.params import (
-    NETWORKS,
+    Params,
     Shapes,
     flatten,
-    parameter_shapes,
     require_finite,
     require_shapes,
     unflatten,
@@ -43,6 +43,7 @@ _FIXED = {
         "overlap_passes",
         "overlap_points",
         "registration_points",
+        "local_geometry",
     )
 }
 _MOST_ENTRIES = 20_000  # the released network has 700
@@ -211,7 +212,7 @@ def _infer(found: Shapes, full: bool, k: int, owner: str) -> ModelConfig:
 
 def _entries(config: ModelConfig, full: bool) -> dict[str, _Entry]:
     """Their name and shape of each of our parameters, by our name."""
-    shapes = parameter_shapes(config, NETWORKS if full else ("overlap",))
+    shapes = overlap_shapes(config) | (registration_shapes(config) if full else {})
     return {name: _entry(name, shape, full) for name, shape in shapes.items()}
 
 
