@@ -26,7 +26,9 @@ from dbdnet_jax.alignment.success import (
     success_probability,
 )
 from dbdnet_jax.alignment.validity import rejection_reason, warnings
+from dbdnet_jax.io.forks import require_own_jax
 from dbdnet_jax.io.point_files import read_points
+from dbdnet_jax.io.programs import loading_seconds
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import load_pretrained
 
@@ -50,7 +52,8 @@ class Alignment:
     ``inlier_ratio`` is the part of the moved source that is within ``inlier_distance`` of the
     target, ``rmse`` its distance. ``information`` (6, 6) is that of the point-to-plane residuals
     for a small rotation (radians) about ``pivot`` and a small translation, in the target's frame;
-    its inverse, where it has one, is the covariance. ``timings`` are seconds.
+    its inverse, where it has one, is the covariance. ``timings`` are seconds;
+    ``programs`` are loading and compiling, which no other counts.
     """
 
     transform: Transform
@@ -116,29 +119,32 @@ def align(
     Raises:
       ValueError: points or arguments of no use, or weights that are not there.
       OSError: a file that cannot be read.
+      RuntimeError: the process was forked after JAX was used, and would hang; spawn it.
     """
-    laps = {"start": time.perf_counter()}
+    require_own_jax("align")
+    laps = {"start": _clock()}
+    loaded = loading_seconds()
     _check_arguments(scale, overlap_threshold, max_points)
     guess = np.eye(4) if initial is None else _check_transform(initial)
     given = read_points(source, "source", seed=seed), read_points(target, "target", seed=seed + 1)
-    laps["read"] = time.perf_counter()
+    laps["read"] = _clock()
     params = load_pretrained() if params is None else params
     if params.overlap is None or params.registration is None:
         raise ValueError("params must hold both networks; one is None. Load a full set of weights.")
     config = dataclasses.replace(params.config, overlap_threshold=float(overlap_threshold))
     params = dataclasses.replace(params, config=config)
-    laps["weights"] = time.perf_counter()
+    laps["weights"] = _clock()
     scene = normalise_pair(*given, scale, max_points, guess)
-    laps["downsample"] = time.perf_counter()
+    laps["downsample"] = _clock()
     predicted = search.predict_pose(params, scene.source.sparse, scene.target.sparse)
-    laps["network"] = time.perf_counter()
+    laps["network"] = _clock()
     distance = inlier_distance(scene.source.dense, scene.target.dense)
     starts = [predicted.transform]
     if initial is not None:
         starts.append(normalised_guess(scene))
     pose = _select_pose(starts, scene, refine)
-    laps["refine"] = time.perf_counter()
-    return _report(scene, predicted, pose, distance, laps)
+    laps["refine"] = _clock()
+    return _report(scene, predicted, pose, distance, laps, loaded)
 
 
 def _select_pose(starts: list[Transform], scene: NormalisedPair, refine: bool) -> Transform:
@@ -160,6 +166,7 @@ def _report(
     pose: Transform,
     distance: float,
     laps: dict[str, float],
+    loaded: float,
 ) -> Alignment:
     """Everything that is known of a pose, in the units and rows of the clouds as given."""
     clouds = scene.source.sparse, scene.target.sparse
@@ -170,12 +177,12 @@ def _report(
     evidence = gather(predicted, pose, quality, alternative, shared)
     probability = success_probability(evidence, load_coefficients())
     reason = rejection_reason(scene, predicted, quality, probability)
-    laps["quality"] = time.perf_counter()
+    laps["quality"] = _clock()
     overlap = (
         _everywhere(scene.source, predicted.source_overlap),
         _everywhere(scene.target, predicted.target_overlap),
     )
-    laps["overlap"] = time.perf_counter()
+    laps["overlap"] = _clock()
     unit = np.repeat([1.0, scene.factor], 3)
     return Alignment(
         transform=as_given(pose, scene),
@@ -192,8 +199,16 @@ def _report(
         information=quality.information * unit * unit[:, None],
         pivot=quality.pivot / scene.factor + scene.target.downsampled.centre,
         evidence=evidence,
-        timings={name: end - start for (_, start), (name, end) in itertools.pairwise(laps.items())},
+        timings={
+            "programs": loading_seconds() - loaded,
+            **{name: end - start for (_, start), (name, end) in itertools.pairwise(laps.items())},
+        },
     )
+
+
+def _clock() -> float:
+    """Seconds without those that loading or compiling programs takes: the first call's alone."""
+    return time.perf_counter() - loading_seconds()
 
 
 def _everywhere(side: NormalisedCloud, values: Float[np.ndarray, " s"]) -> Float[np.ndarray, " n"]:
