@@ -142,7 +142,7 @@ def _read_value(kind: Any, value: Any, where: str) -> Any:
         raise ValueError(
             f"{where} must be finite and below {LARGEST:g}; got {value!r:.60}. Give such a number."
         )
-    return value
+    return float(value) if kind is float else value
 
 
 def stage_record(config: RunConfig, stage: str) -> dict[str, Any]:
