@@ -1,11 +1,14 @@
 """``dbdnet-register``: `align` for the command line."""
 
 import argparse
+import functools
 import io
 import math
 import os
+import re
 import shlex
 import sys
+import traceback
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -89,7 +92,8 @@ def _run_all(options: argparse.Namespace) -> int:
     """Every pair that is asked for; the largest exit status."""
     jobs = _jobs(options)
     settings = _settings(options)
-    return max([_guarded(lambda job=job: _run(job, options, settings), job[0][3]) for job in jobs])
+    runs = [functools.partial(_run, job, options, settings) for job in jobs]
+    return max([_guarded(run, job.pair.origin) for run, job in zip(runs, jobs, strict=True)])
 
 
 def _guarded(run: Callable[[], int], origin: str) -> int:
@@ -100,9 +104,9 @@ def _guarded(run: Callable[[], int], origin: str) -> int:
         raise
     except Exception as error:  # a traceback tells most people nothing, and status 1 is taken
         if os.environ.get(DEBUG):
-            raise
+            traceback.print_exc()
         what, status = str(error), UNUSABLE
-        if isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in what:
+        if isinstance(error, MemoryError) or re.search("RESOURCE_EXHAUSTED|[Oo]ut of memory", what):
             what, status = (
                 f"out of memory: {what.splitlines()[0] if what else 'no details'}",
                 FAILED,
@@ -197,7 +201,8 @@ def _jobs(options: argparse.Namespace) -> list[Job]:
         require_drawing()
     outputs = options.output, options.save_aligned, options.report, options.png
     if options.batch is None:
-        jobs = [Job(FilePair("", *options.clouds, ""), *outputs)]
+        source, target = options.clouds
+        jobs = [Job(FilePair("", source, target, ""), *outputs)]
     else:
         jobs = [
             Job(

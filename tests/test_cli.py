@@ -158,8 +158,8 @@ def test_an_unexpected_error_costs_its_pair_alone(run, tmp_path, monkeypatch, er
 def test_a_traceback_is_shown_to_who_asks_for_it(run, monkeypatch):
     monkeypatch.setattr(ALIGN, "align", lambda *_, **__: {}["x"])
     monkeypatch.setenv("DBDNET_DEBUG", "1")
-    with pytest.raises(KeyError):
-        run("a.ply", "b.ply")
+    status, _, err = run("a.ply", "b.ply")
+    assert status == FAILED and "Traceback" in err and "KeyError: 'x'" in err
 
 
 def test_a_name_does_not_steer_the_terminal(run, folder):

@@ -51,7 +51,8 @@ def check_pickle(stream: Any, most_opcodes: int = MOST_OPCODES) -> None:
     stack: list[Any] = []
     memo: dict[int, Any] = {}
     leaf, large = _Parts([]), 0
-    for number, (opcode, argument, _) in enumerate(pickletools.genops(stream)):
+    opcodes: Any = pickletools.genops(stream)
+    for number, (opcode, argument, _) in enumerate(opcodes):
         name, before = opcode.name, opcode.stack_before
         if number > most_opcodes:
             raise CheckpointError(

@@ -92,7 +92,8 @@ def _compiled(function: Callable, name: str, arguments: tuple) -> Callable:
     if not folder:
         return jax.jit(function).lower(*shapes).compile()
     # Of this thread, where a context manager may have changed them.
-    precision = (jax.config.jax_enable_x64, jax.config.jax_default_matmul_precision)
+    names = ("jax_enable_x64", "jax_default_matmul_precision")
+    precision = [getattr(jax.config, name) for name in names]
     versions = jax.__version__, jaxlib.__version__
     identity = repr((name, shapes, versions, jax.default_backend(), precision, _source_hash()))
     path = Path(folder) / f"{hashlib.sha256(identity.encode()).hexdigest()[:32]}.stablehlo"
