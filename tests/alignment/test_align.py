@@ -12,22 +12,25 @@ from scipy.spatial.transform import Rotation
 
 from dbdnet_jax.alignment.align import Alignment
 from dbdnet_jax.alignment.downsampling import DENSE, UNIT_SIZE, downsample, farthest_rows
+from dbdnet_jax.alignment.finding import LIKELY
 from dbdnet_jax.alignment.normalised import is_full_resolution, normalise_pair
 from dbdnet_jax.alignment.quality import (
     CHANCE_RATIO,
     Motion,
+    PoseQuality,
     assess_pose,
     in_words,
-    inlier_distance,
     shared_point_score,
 )
 from dbdnet_jax.alignment.success import (
     Coefficients,
+    FitFeatures,
+    Logistic,
     PoseFeatures,
     load_coefficients,
     success_probability,
 )
-from dbdnet_jax.alignment.validity import LIKELY
+from dbdnet_jax.alignment.surfaces import inlier_distance, surface
 from tests.aligning import motion, pair, rotation_error_deg, solid, tiny_align
 from tests.conftest import random_cloud
 
@@ -85,8 +88,7 @@ def test_the_timings_add_up_and_nothing_else_is_random(plain):
         "read",
         "weights",
         "downsample",
-        "network",
-        "refine",
+        "search",
         "quality",
         "overlap",
     }
@@ -149,7 +151,7 @@ def test_refinement_is_a_choice():
 def test_the_threshold_becomes_the_networks(monkeypatch):
     seen = []
 
-    def ask(params, *clouds):
+    def ask(params, *_):
         seen.append(params.config.overlap_threshold)
         raise KeyboardInterrupt
 
@@ -202,18 +204,29 @@ def sphere(count: int, seed: int) -> np.ndarray:
     return points / np.linalg.norm(points, axis=1, keepdims=True)
 
 
+def on_a_floor(count: int, seed: int) -> np.ndarray:
+    floor = random_cloud(seed, 20 * count // 21) * [1.0, 1.0, 0.0]
+    return np.vstack([0.2 * solid(count // 21, seed) + [0, 0, 0.06], floor])
+
+
+def assessed(source: np.ndarray, target: np.ndarray) -> PoseQuality:
+    """The quality of no motion between two clouds."""
+    sides = surface(source), surface(target)
+    return assess_pose(source, sides[1], inlier_distance(*sides))
+
+
 @pytest.mark.parametrize(
-    ("surface", "words"),
+    ("shape", "words"),
     [
         (plane, "translation along every axis normal to [0 0 1] and rotation about [0 0 1]"),
         (cylinder, "translation along [0 0 1] and rotation about [0 0 1]"),
         (sphere, "rotation about every axis"),
         (solid, ""),
+        (on_a_floor, ""),
     ],
 )
-def test_degenerate_motions_are_named(surface, words):
-    clouds = surface(3000, 1), surface(3000, 2)
-    quality = assess_pose(*clouds, inlier_distance(*clouds))
+def test_degenerate_motions_are_named(shape, words):
+    quality = assessed(shape(3000, 1), shape(3000, 2))
     assert in_words(tuple(_snap(motion) for motion in quality.degenerate_motions)) == words
 
 
@@ -224,8 +237,7 @@ def _snap(motion: Motion) -> Motion:
 
 
 def test_information_is_the_curvature_of_the_plane_residuals():
-    clouds = solid(2000, 1), solid(2000, 2)
-    quality = assess_pose(*clouds, inlier_distance(*clouds))
+    quality = assessed(solid(2000, 1), solid(2000, 2))
     assert np.all(np.linalg.eigvalsh(quality.information) > 0)
     # 2000 points that are off by plane_rmse fix a translation to about this, in each direction.
     sigma = np.sqrt(np.diag(np.linalg.inv(quality.information))[3:])
@@ -242,7 +254,8 @@ def test_points_coincide_where_clouds_share_them_in_the_right_pose_only(even):
     noisy = points + random_cloud(3, len(points)) * 0.2 * spacing
 
     def between(source, target):
-        return shared_point_score(source, target, inlier_distance(source, target))
+        sides = surface(source), surface(target)
+        return shared_point_score(source, sides[1], inlier_distance(*sides))
 
     assert between(points, points) == CHANCE_RATIO
     assert between(noisy, points) > 0.3
@@ -274,14 +287,17 @@ def test_clouds_of_different_units_are_refused():
 
 
 def test_a_probability_is_a_logistic_of_standardised_evidence():
-    def evidence(value: float) -> PoseFeatures:
-        return PoseFeatures(*[value] * len(PoseFeatures._fields))
+    fields = len(PoseFeatures._fields)
+    fitted = Logistic((1.0,) * fields, (2.0,) * fields, (0.5,) * fields, -1.0)
+    unused = Logistic(*((1.0,) * len(FitFeatures._fields) for _ in range(3)), 0.0)
 
-    fitted = Coefficients(evidence(1), evidence(2), evidence(0.5), -1.0)
-    terms = len(PoseFeatures._fields) * 0.5 * (3 - 1) / 2
-    assert success_probability(evidence(3), fitted) == pytest.approx(1 / (1 + np.exp(1 - terms)))
-    assert 0 < success_probability(evidence(-1e9), fitted) < LIKELY
-    assert load_coefficients().bias == load_coefficients().bias  # the shipped file is whole
+    def probability(value: float) -> float:
+        return success_probability(PoseFeatures(*[value] * fields), Coefficients(unused, fitted))
+
+    terms = fields * 0.5 * (3 - 1) / 2
+    assert probability(3) == pytest.approx(1 / (1 + np.exp(1 - terms)))
+    assert 0 < probability(-1e9) < LIKELY
+    assert load_coefficients() == load_coefficients()  # the shipped file is whole
 
 
 def test_damaged_coefficients_are_named(tmp_path):

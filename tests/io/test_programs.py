@@ -15,7 +15,7 @@ from tests.aligning import tiny_params
 from tests.conftest import random_cloud
 from tests.test_structure import imported_names
 
-NOT_TRACED = {"programs", "files", "safe_pickle", "quality"}
+NOT_TRACED = {"programs", "files", "safe_pickle", "surfaces", "transforms"}
 BUCKETS = {192, 384, 768, 1536}
 
 
