@@ -41,7 +41,7 @@ def normalise_pair(
     """Downsample, centre, turn and scale two clouds, in float64.
 
     Raises:
-      ValueError: a cloud whose points are at too few places.
+      ValueError: a cloud whose points are at too few places, or a scale beyond float32.
     """
     downsampled = downsample(source, max_points), downsample(target, max_points)
     for name, rows in zip(("source", "target"), downsampled, strict=True):
@@ -50,7 +50,13 @@ def normalise_pair(
                 f"{name} must have points at {MIN_POINTS} places at least; got "
                 f"{len(rows.sparse)}. Give more points."
             )
-    factor = UNIT_SIZE / max(rows.size for rows in downsampled) if scale == "auto" else float(scale)
+    size = max(rows.size for rows in downsampled)
+    factor = UNIT_SIZE / size if scale == "auto" else float(scale)
+    if not 1e-6 <= size * factor <= 1e6:
+        raise ValueError(
+            f"scale must bring the clouds to a size from 1e-6 to 1e6, of which the weights know "
+            f"{UNIT_SIZE:g}; scale={factor:g} makes {size * factor:g} of {size:g}. Use 'auto'."
+        )
 
     def side(points, rows, turn):
         dense = (points[rows.dense] - rows.centre) @ turn.T * factor

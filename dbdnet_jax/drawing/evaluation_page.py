@@ -54,9 +54,9 @@ def _best(evaluation: Evaluation) -> str:
 
 
 def network_row(evaluation: Evaluation) -> Row | None:
-    """The first row of trained weights."""
+    """The first row of trained weights that has a motion."""
     for row in evaluation.rows:
-        if row.method.startswith("DBDNet") and "untrained" not in row.method:
+        if row.traits.learned and not row.traits.untrained and row.summary is not None:
             return row
     return None
 
@@ -69,7 +69,7 @@ def _table(shown: Table) -> Iterator[Markup]:
 
 def _distributions(evaluation: Evaluation, places: dict[str, int]) -> Iterator[Markup]:
     """For every method the share of pairs below each error."""
-    scored = [(row.method, row.errors) for row in evaluation.rows if row.errors is not None]
+    scored = [(row, row.errors) for row in evaluation.rows if row.errors is not None]
     if not scored:
         return
     for heading, field, axis, least in (
@@ -78,18 +78,19 @@ def _distributions(evaluation: Evaluation, places: dict[str, int]) -> Iterator[M
     ):
         text = "Share of the pairs whose error is below; higher and farther left is better."
         lines = [
-            _cumulative(name, places[name], getattr(errors, field), least)
-            for name, errors in scored
+            _cumulative(row, places[row.method], getattr(errors, field), least)
+            for row, errors in scored
         ]
         log = {"type": "log", "dtick": 1, "exponentformat": "none"}
         figure = figures.curves(lines, axis, "pairs, %", "lines", **log)
         yield plot(heading, text, figure)
 
 
-def _cumulative(name: str, place: int, errors: Float[np.ndarray, " p"], least: float) -> Curve:
+def _cumulative(row: Row, place: int, errors: Float[np.ndarray, " p"], least: float) -> Curve:
     errors = np.maximum(np.sort(errors), least)
     share = 100 * np.arange(1, len(errors) + 1) / len(errors)
-    return Curve(html.escape(name), place, errors.tolist(), share.tolist())
+    name = html.escape(row.method)
+    return Curve(name, place, errors.tolist(), share.tolist(), row.traits.learned)
 
 
 def _sweeps(run_dir: Path, places: dict[str, int]) -> Iterator[Markup]:
@@ -108,14 +109,21 @@ def _sweeps(run_dir: Path, places: dict[str, int]) -> Iterator[Markup]:
 def _read_sweep(path: Path, name: str, places: dict[str, int]) -> tuple[list[Curve], str, str]:
     """Curves and the words at the axes."""
     found: dict[str, list[tuple[float, float]]] = {}
+    learned = {}
     with path.open(newline="", encoding="utf-8") as file:
         for line in csv.DictReader(file):
             point = float(line["value"]), float(line["error_r"])
             found.setdefault(line["method"], []).append(point)
+            learned[line["method"]] = line.get("learned") == "1"
     if not found:
         raise ValueError("it holds no line")
     lines = [
-        Curve(html.escape(method), places.get(method, place), *zip(*points, strict=True))
+        Curve(
+            html.escape(method),
+            places.get(method, place),
+            *zip(*points, strict=True),
+            learned=learned[method],
+        )
         for place, (method, points) in enumerate(found.items(), len(places))
     ]
     label = SWEEPS[name].label if name in SWEEPS else html.escape(name)

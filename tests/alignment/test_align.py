@@ -85,6 +85,7 @@ def test_the_timings_add_up_and_nothing_else_is_random(plain):
     again = tiny_align(SOURCE, TARGET, initial=TRUE)
     np.testing.assert_array_equal(again.transform, plain.transform)
     assert set(plain.timings) == {
+        "programs",
         "read",
         "weights",
         "downsample",
