@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from dbdnet_jax.alignment import pose_graph, search
+from dbdnet_jax.alignment import pose_graph, search, transforms
 from dbdnet_jax.alignment import validity as verdict
 from dbdnet_jax.alignment.align import Alignment, Matches
 from dbdnet_jax.alignment.align_many import align_many
