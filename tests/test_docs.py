@@ -126,7 +126,10 @@ def test_tests_and_files_that_a_page_names_exist(page):
         assert any(f"def {name}(" in source for source in sources.values()), name
     for name in re.findall(r"`((?:dbdnet_jax|configs|tools|examples|docs)/[\w./]+)`", text):
         assert (ROOT / name).exists(), name
-    for name in re.findall(r"`((?:model|ops|data|alignment)/\w+\.py)`", text):
+    for name in re.findall(
+        r"`((?:classical|data|alignment|evaluation|io|metrics|networks|ops|training)/[\w/]+\.py)`",
+        text,
+    ):
         assert (ROOT / "dbdnet_jax" / name).exists(), name
 
 

@@ -62,7 +62,7 @@ def predict_pose(params: Params, source: Points, target: OtherPoints) -> Network
 
     def network(weights, source, target):
         weights = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), weights)
-        answer = register_clouds(Params(*weights, config), Cloud(*source), Cloud(*target))
+        answer = register_clouds(Params(weights, config), Cloud(*source), Cloud(*target))
         branches = answer.rotation_branch, answer.translation_branch
         return (
             answer.rotation,
@@ -75,8 +75,7 @@ def predict_pose(params: Params, source: Points, target: OtherPoints) -> Network
             answer.valid,
         )
 
-    weights = params.overlap, params.registration
-    answer = _run(repr(config), network, weights, *_pad(source, target))
+    answer = _run(repr(config), network, params.networks, *_pad(source, target))
     rotation, translation, source_overlap, target_overlap, kept, mass, confidence, valid = answer
     n, m = len(source), len(target)
     return NetworkPose(

@@ -136,7 +136,7 @@ def _downsample(cloud: Cloud) -> Cloud:
 
 def _middle(points: Float[Array, "n 3"], cloud: Cloud) -> Float[Array, "3"]:
     """The mean of the valid rows of ``points``."""
-    total = jnp.sum(jnp.where(_valid(cloud)[:, None], points, 0.0), axis=0)
+    total = jnp.sum(jnp.where(cloud.valid[:, None], points, 0.0), axis=0)
     return total / jnp.maximum(cloud.count, 1)
 
 
@@ -144,7 +144,7 @@ def _turned(source: Cloud, pose: Rigid, angles_deg: tuple[float, ...]) -> Rigid:
     """The pose and its turns, stacked; see `refine_from_rotations`."""
     moved = rigid.apply(pose, source.points)
     middle = _middle(moved, source)
-    arms = jnp.where(_valid(source)[:, None], moved - middle[None, :], 0.0)
+    arms = jnp.where(source.valid[:, None], moved - middle[None, :], 0.0)
     axes = jnp.linalg.eigh(jnp.matmul(arms.T, arms, precision=HIGHEST))[1].T
     angles = jnp.deg2rad(jnp.array(angles_deg, moved.dtype))
     turns = jax.vmap(jax.vmap(rigid.rotation_about, (None, 0)), (0, None))(axes, angles)
@@ -176,16 +176,12 @@ def _truncated_rmse(
 ) -> Float[Array, ""]:
     source, target = views
     squares = squared_distances(rigid.apply(motion, source.points), target.points)
-    rows, columns = _valid(source), _valid(target)
+    rows, columns = source.valid, target.valid
     squares = jnp.where(rows[:, None] & columns[None, :], squares, jnp.inf)
     squares = jnp.minimum(squares, jnp.square(cap))
     ways = jnp.where(rows, squares.min(axis=1), 0.0), jnp.where(columns, squares.min(axis=0), 0.0)
     total = sum(jnp.sum(way) for way in ways)
     return jnp.sqrt(total / jnp.maximum(source.count + target.count, 1))
-
-
-def _valid(cloud: Cloud) -> Bool[Array, " n"]:
-    return prefix_mask(len(cloud.points), cloud.count)
 
 
 def _step(scene: _PreparedPair, motion: Rigid, radius: Float[Array, ""]) -> Rigid:
@@ -231,7 +227,7 @@ def _match(moved: Cloud, target: Cloud, radius: Float[Array, ""]) -> Float[Array
     """Soft matching, the sum of both ways; what has little within the radius is hardly matched."""
     squares = squared_distances(moved.points, target.points)
     kernel = jnp.maximum(1.0 - squares / radius**2, 0.0) ** 2
-    kernel = jnp.where(_valid(moved)[:, None] & _valid(target)[None, :], kernel, 0.0)
+    kernel = jnp.where(moved.valid[:, None] & target.valid[None, :], kernel, 0.0)
     forth = 1.0 / (OUTLIER_MASS + kernel.sum(axis=1))
     back = 1.0 / (OUTLIER_MASS + kernel.sum(axis=0))
     return kernel * (forth[:, None] + back[None, :])

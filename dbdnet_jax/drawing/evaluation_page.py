@@ -43,9 +43,9 @@ def _best(evaluation: Evaluation) -> str:
 
 
 def network_row(evaluation: Evaluation) -> Row | None:
-    """The first row of trained weights."""
+    """The first row of trained weights that has a motion."""
     for row in evaluation.rows:
-        if row.method.startswith("DBDNet") and "untrained" not in row.method:
+        if row.traits.learned and not row.traits.untrained and row.summary is not None:
             return row
     return None
 
@@ -57,7 +57,7 @@ def _with_whole_heads(shown: Table) -> Table:
 
 def _distributions(evaluation: Evaluation, places: dict[str, int]) -> Iterator[Plot]:
     """For every method the share of pairs below each error."""
-    scored = [(row.method, row.errors) for row in evaluation.rows if row.errors is not None]
+    scored = [(row, row.errors) for row in evaluation.rows if row.errors is not None]
     if not scored:
         return
     for heading, field, axis, least in (
@@ -66,18 +66,18 @@ def _distributions(evaluation: Evaluation, places: dict[str, int]) -> Iterator[P
     ):
         text = "Share of the pairs whose error is below; higher and farther left is better."
         lines = [
-            _cumulative(name, places[name], getattr(errors, field), least)
-            for name, errors in scored
+            _cumulative(row, places[row.method], getattr(errors, field), least)
+            for row, errors in scored
         ]
         log = {"type": "log", "dtick": 1, "exponentformat": "none"}
         figure = figures.curves(lines, axis, "pairs, %", "lines", **log)
         yield Plot(heading, text, figure)
 
 
-def _cumulative(name: str, place: int, errors: Float[np.ndarray, " p"], least: float) -> Curve:
+def _cumulative(row: Row, place: int, errors: Float[np.ndarray, " p"], least: float) -> Curve:
     errors = np.maximum(np.sort(errors), least)
     share = 100 * np.arange(1, len(errors) + 1) / len(errors)
-    return Curve(name, place, errors.tolist(), share.tolist())
+    return Curve(row.method, place, errors.tolist(), share.tolist(), row.traits.learned)
 
 
 def _sweeps(run_dir: Path, places: dict[str, int]) -> Iterator[Plot]:
@@ -96,14 +96,21 @@ def _sweeps(run_dir: Path, places: dict[str, int]) -> Iterator[Plot]:
 def _read_sweep(path: Path, name: str, places: dict[str, int]) -> tuple[list[Curve], str, str]:
     """Curves and the words at the axes."""
     found: dict[str, list[tuple[float, float]]] = {}
+    learned = {}
     with path.open(newline="", encoding="utf-8") as file:
         for line in csv.DictReader(file):
             point = float(line["value"]), float(line["error_r"])
             found.setdefault(line["method"], []).append(point)
+            learned[line["method"]] = line.get("learned") == "1"
     if not found:
         raise ValueError("it holds no line")
     lines = [
-        Curve(method, places.get(method, place), *zip(*points, strict=True))
+        Curve(
+            method,
+            places.get(method, place),
+            *zip(*points, strict=True),
+            learned=learned[method],
+        )
         for place, (method, points) in enumerate(found.items(), len(places))
     ]
     label = SWEEPS[name].label if name in SWEEPS else name

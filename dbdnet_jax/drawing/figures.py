@@ -29,12 +29,16 @@ BINS_WITHIN, BINS = 8, 40  # bars below the inlier distance, and in all
 
 
 class Curve(NamedTuple):
-    """One method's line of a chart; ``place`` is its number, which decides its look."""
+    """One method's line of a chart; ``place`` is its number, which decides its look.
+
+    A ``learned`` method's line is thick.
+    """
 
     name: str
     place: int
     x: Sequence[float]
     y: Sequence[float]
+    learned: bool = False
 
 
 def two_clouds(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) -> "Figure":
@@ -107,7 +111,7 @@ def curves(lines: Sequence[Curve], x: str, y: str, mode: str, **axis: Any) -> "F
 
     def look(line: Curve) -> dict[str, Any]:
         colour = CURVES[line.place % len(CURVES)]
-        if line.name.startswith("DBDNet"):
+        if line.learned:
             return {"color": colour, "width": 3}
         return {"color": colour, "width": 1.5, "dash": DASHES[line.place % len(DASHES)]}
 

@@ -14,20 +14,8 @@ import numpy as np
 
 from dbdnet_jax.io.files import write_atomic
 from dbdnet_jax.io.safe_pickle import CheckpointError
-from dbdnet_jax.networks.dbdnet.config import ModelConfig
-from dbdnet_jax.networks.dbdnet.register import Params
-from dbdnet_jax.networks.dbdnet.released import from_released, to_released
-from dbdnet_jax.networks.params import flatten, parameter_shapes, require_shapes, unflatten
-
-__all__ = [
-    "CheckpointError",
-    "from_released",
-    "load_metadata",
-    "load_params",
-    "load_pretrained",
-    "save_params",
-    "to_released",
-]
+from dbdnet_jax.networks.params import Params, flatten, require_shapes, unflatten
+from dbdnet_jax.networks.table import DEFAULT_METHOD, LEARNED, method_of, parameter_shapes
 
 PRETRAINED = Path(__file__).parent / "pretrained"
 _FORMAT = 1
@@ -43,7 +31,7 @@ def save_params(
 
     Args:
       path: the file; its folder must exist. An existing file is replaced.
-      params: the parameters; a network that is None is left out.
+      params: the parameters of any method, all of its networks or some.
       metadata: anything JSON can hold, for people: origin, data, figures.
 
     Raises:
@@ -52,14 +40,15 @@ def save_params(
     """
     arrays = flatten(params)
     _check(arrays, params.config, "params")
-    header = json.dumps(
-        {
-            "format": _FORMAT,
-            "model": dataclasses.asdict(params.config),
-            "metadata": dict(metadata or {}),
-        },
-        sort_keys=True,
-    )
+    content = {
+        "format": _FORMAT,
+        "model": dataclasses.asdict(params.config),
+        "metadata": dict(metadata or {}),
+    }
+    method = method_of(params.config)
+    if method != DEFAULT_METHOD:
+        content["method"] = method
+    header = json.dumps(content, sort_keys=True)
     path = Path(path)
     if not path.parent.is_dir():
         raise FileNotFoundError(
@@ -80,19 +69,35 @@ def load_params(path: str | Path) -> Params:
       OSError: the file cannot be opened.
     """
     header, arrays = _read(path)
-    fields = {field.name for field in dataclasses.fields(ModelConfig)}
-    unknown = sorted(set(header["model"]) - fields)
+    method = header.get("method", DEFAULT_METHOD)
+    config = read_model(method, header["model"], str(path))
+    _check(arrays, config, str(path))
+    return unflatten(arrays, config)
+
+
+def read_model(method: str, fields: Mapping[str, Any], owner: str) -> Any:
+    """The configuration of a method's network from its fields, as JSON holds them.
+
+    Raises:
+      CheckpointError: a method or a field that this release does not know, or a value it refuses.
+    """
+    if method not in LEARNED:
+        raise CheckpointError(
+            f"{owner}: the method must be one of {', '.join(LEARNED)}; got {method!r}. Update "
+            "dbdnet_jax: a newer release wrote the file."
+        )
+    record = LEARNED[method].config
+    unknown = sorted(set(fields) - {field.name for field in dataclasses.fields(record)})
     if unknown:
         raise CheckpointError(
-            f"{path}: every field of the configuration must be known; {', '.join(unknown)} "
+            f"{owner}: every field of the configuration must be known; {', '.join(unknown)} "
             "is not. Update dbdnet_jax: a newer release wrote the file."
         )
     try:
-        config = ModelConfig(**header["model"])
+        # JSON has no tuples; a configuration must be hashable.
+        return record(**{k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()})
     except (TypeError, ValueError) as error:
-        raise CheckpointError(f"{path}: the configuration cannot be built: {error}") from error
-    _check(arrays, config, str(path))
-    return unflatten(arrays, config)
+        raise CheckpointError(f"{owner}: the configuration cannot be built: {error}") from error
 
 
 def load_metadata(path: str | Path) -> dict[str, Any]:
@@ -169,7 +174,7 @@ def _read(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     return header, arrays
 
 
-def _check(arrays: Mapping[str, np.ndarray], config: ModelConfig, owner: str) -> None:
+def _check(arrays: Mapping[str, np.ndarray], config: Any, owner: str) -> None:
     """Refuse arrays that are not the parameters of the networks they name."""
     expected = parameter_shapes(config, {name.split("/")[0] for name in arrays})
     require_shapes(

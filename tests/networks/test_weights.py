@@ -11,7 +11,8 @@ import pytest
 
 from dbdnet_jax.networks import weights
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
-from dbdnet_jax.networks.params import parameter_shapes, unflatten
+from dbdnet_jax.networks.params import unflatten
+from dbdnet_jax.networks.table import parameter_shapes
 from dbdnet_jax.networks.weights import CheckpointError, load_metadata, load_params, save_params
 from tests.torch_files import save_zip, tensor
 
@@ -151,7 +152,7 @@ def test_what_could_not_be_loaded_is_not_saved(tmp_path):
     with pytest.raises(CheckpointError, match="misshapen"):
         save_params(tmp_path / "w.npz", params.replace(config=ModelConfig()))
     with pytest.raises(CheckpointError, match="no array"):
-        save_params(tmp_path / "w.npz", params.replace(overlap=None, registration=None))
+        save_params(tmp_path / "w.npz", params.replace(networks={}))
     with pytest.raises(FileNotFoundError, match="absent does not. Create it"):
         save_params(tmp_path / "absent" / "w.npz", params)
     assert not list(tmp_path.iterdir())

@@ -11,7 +11,7 @@ import pytest
 from dbdnet_jax.io.safe_pickle import CheckpointError
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.training.checkpoint import Checkpoints, load_best, write_stage
-from dbdnet_jax.training.loop import init_state
+from dbdnet_jax.training.step import init_state
 from tests.conftest import EXACT, assert_close
 
 OPTIMIZER = optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(lambda step: 1e-3 / (step + 1)))

@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass
 
-Layers = tuple[tuple[int, int], ...]  # (features, groups of the norm) of each layer
+from dbdnet_jax.networks.blocks import Layers
+from dbdnet_jax.ops.local_geometry import FEATURES, RADII
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class ModelConfig:
     overlap_passes: int = 1  # more: again over the clouds as the last one's answer aligns them
     overlap_points: int = 0  # that the overlap network sees, farthest first; 0: all
     registration_points: int = 0  # of the selected ones, that are matched; 0: all
+    local_geometry: int = 0  # radii at which the encoders see the surface around a point
     overlap_threshold: float = 0.5
     min_points: int = 160  # the most probable rows kept when fewer pass the threshold
     iterations: int = 1
@@ -78,6 +80,12 @@ class ModelConfig:
                     f"released network has no such limit); got {points}, released="
                     f"{self.released}. Use 0."
                 )
+        if not 0 <= self.local_geometry <= len(RADII) or (self.local_geometry and self.released):
+            raise ValueError(
+                f"local_geometry must be from 0 to {len(RADII)} radii, and 0 where released=True "
+                f"(the released network has no such input); got {self.local_geometry}, released="
+                f"{self.released}. Use 0."
+            )
         if self.overlap_matching and self.released:
             raise ValueError(
                 "overlap_matching must be False where released=True: the released network has no "
@@ -85,6 +93,11 @@ class ModelConfig:
             )
         if not 0.0 <= self.dropout < 1.0:
             raise ValueError(f"dropout must be in [0, 1); got {self.dropout}.")
+
+    @property
+    def inputs(self) -> int:
+        """What an encoder is given of each point: coordinates and local geometry."""
+        return 3 + FEATURES * self.local_geometry
 
     @property
     def solves(self) -> int:

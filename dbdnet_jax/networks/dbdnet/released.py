@@ -16,15 +16,9 @@ import numpy as np
 from dbdnet_jax.io.safe_pickle import CheckpointError
 from dbdnet_jax.io.torch_pickle import load_torch
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
-from dbdnet_jax.networks.dbdnet.register import Params
-from dbdnet_jax.networks.params import (
-    NETWORKS,
-    Shapes,
-    flatten,
-    parameter_shapes,
-    require_shapes,
-    unflatten,
-)
+from dbdnet_jax.networks.dbdnet.overlap import overlap_shapes
+from dbdnet_jax.networks.dbdnet.registration import registration_shapes
+from dbdnet_jax.networks.params import Params, Shapes, flatten, require_shapes, unflatten
 
 _NESTED = ("state_dict", "model_state_dict", "model", "net", "network")
 _OVERLAP = "overlap_predictor."
@@ -42,6 +36,7 @@ _FIXED = {
         "overlap_passes",
         "overlap_points",
         "registration_points",
+        "local_geometry",
     )
 }
 _FIX = "Give a checkpoint that the released code saved, unaltered."
@@ -200,7 +195,7 @@ def _infer(found: Shapes, full: bool, k: int, owner: str) -> ModelConfig:
 
 def _entries(config: ModelConfig, full: bool) -> dict[str, _Entry]:
     """Their name and shape of each of our parameters, by our name."""
-    shapes = parameter_shapes(config, NETWORKS if full else ("overlap",))
+    shapes = overlap_shapes(config) | (registration_shapes(config) if full else {})
     return {name: _entry(name, shape, full) for name, shape in shapes.items()}
 
 

@@ -10,7 +10,8 @@ import pytest
 from dbdnet_jax.io.safe_pickle import CheckpointError
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.dbdnet.released import from_released, to_released
-from dbdnet_jax.networks.params import flatten, parameter_shapes, unflatten
+from dbdnet_jax.networks.params import flatten, unflatten
+from dbdnet_jax.networks.table import parameter_shapes
 from tests.torch_files import save_stream, save_zip, tensor
 
 # Written once and checked against the names and shapes of a model built by the released code.
@@ -194,4 +195,4 @@ def test_what_their_code_cannot_run_is_not_written(state):
     with pytest.raises(ValueError, match="neighbour_space is 'feature' .* got 'coordinates'"):
         to_released(params.replace(config=ModelConfig(neighbour_space="coordinates")))
     with pytest.raises(ValueError, match="overlap=None"):
-        to_released(params.replace(overlap=None))
+        to_released(params.replace(networks={"registration": params.registration}))
