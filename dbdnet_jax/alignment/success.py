@@ -7,7 +7,7 @@ coefficients lie beside the weights they belong to.
 import json
 import math
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from dbdnet_jax.alignment.surfaces import PoseFit
 from dbdnet_jax.networks.weights import PRETRAINED
@@ -90,6 +90,13 @@ def success_probability(evidence: PoseFeatures, coefficients: Coefficients) -> f
     return 1 / (1 + math.exp(-min(max(coefficients.success.logit(evidence), -50.0), 50.0)))
 
 
+def _logistic(held: dict[str, Any], kind: type[FitFeatures] | type[PoseFeatures]) -> Logistic:
+    mean, deviation, weight = (
+        tuple(float(held[part][name]) for name in kind._fields) for part in PARTS
+    )
+    return Logistic(mean, deviation, weight, float(held["bias"]))
+
+
 def load_coefficients(path: Path = SUCCESS_FILE) -> Coefficients:
     """Read what ``tools/fit_success.py`` wrote.
 
@@ -100,10 +107,7 @@ def load_coefficients(path: Path = SUCCESS_FILE) -> Coefficients:
     try:
         held = json.loads(path.read_text())
         rank, success = (
-            Logistic(
-                *(tuple(float(held[name][part][x]) for x in kind._fields) for part in PARTS),
-                bias=float(held[name]["bias"]),
-            )
+            _logistic(held[name], kind)
             for name, kind in (("rank", FitFeatures), ("success", PoseFeatures))
         )
         return Coefficients(rank, success)

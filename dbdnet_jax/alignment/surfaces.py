@@ -75,10 +75,12 @@ def measure_fit(pose: Transform, source: Surface, target: Surface, distance: flo
     cosine = np.concatenate([way[1] for way in (forth, back)])[near]
     plane = np.concatenate([way[2] for way in (forth, back)])[near]
     return PoseFit(
-        *(float(way[0].mean()) for way in (forth, back)),
-        *(float(_tight(*way, distance).mean()) for way in (forth, back)),
-        float(cosine.mean()),
-        float(np.sqrt(np.mean(plane**2))) / distance,
+        source_inliers=float(forth[0].mean()),
+        target_inliers=float(back[0].mean()),
+        source_tight=float(_tight(*forth, distance).mean()),
+        target_tight=float(_tight(*back, distance).mean()),
+        normal_agreement=float(cosine.mean()),
+        plane_rmse=float(np.sqrt(np.mean(plane**2))) / distance,
     )
 
 

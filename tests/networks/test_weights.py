@@ -240,9 +240,8 @@ def test_a_header_of_wrong_types_or_out_of_bounds_is_refused(path, field, value)
 )
 def test_a_header_that_is_none_is_refused(path, header):
     rewrite(path, members(path) | {"header": np.array(header)}, valid=True)
-    for read in (load_params, load_metadata):
-        with pytest.raises(CheckpointError, match=r"w\.npz: the (header|format) must"):
-            read(path)
+    with pytest.raises(CheckpointError, match=r"w\.npz: the (header|format) must"):
+        load_params(path)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300])
