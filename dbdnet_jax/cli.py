@@ -137,6 +137,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--batch", type=Path, metavar="PAIRS", help="a list of pairs, or a folder")
     add("--json", action="store_true", help="print JSON, a line for each pair, instead of text")
     add("--params", default="cad", metavar="W", help="weights: a .npz file, or a name (cad)")
+    add("--search", choices=("auto", "near", "any"), default="auto", help="which rotations")
     add("--refine", action=argparse.BooleanOptionalAction, default=True, help="refine the pose")
     add("--initial", type=Path, metavar="T", help="a first guess of the transform")
     add("--scale", type=_scale, default="auto", help="factor to the weights' unit, or auto")
@@ -185,6 +186,7 @@ def _settings(options: argparse.Namespace) -> dict:
     return {
         "params": load_named(options.params),
         "refine": options.refine,
+        "search": options.search,
         "initial": None if options.initial is None else read_transform(options.initial),
         "scale": options.scale,
         "overlap_threshold": options.overlap_threshold,
@@ -276,7 +278,7 @@ def summary(source: Path, target: Path, alignment: "Alignment") -> list[str]:
     """An alignment in a few lines."""
     from scipy.spatial.transform import Rotation
 
-    from dbdnet_jax.alignment.success import SUCCESS_DEG
+    from dbdnet_jax.alignment.success import SUCCESS_DEG, SUCCESS_PART
 
     turn = Rotation.from_matrix(alignment.rotation).magnitude()
     rows = [" ".join(f"{x:16.9g}" for x in row) for row in alignment.transform]
@@ -287,8 +289,9 @@ def summary(source: Path, target: Path, alignment: "Alignment") -> list[str]:
         f"rotation     {math.degrees(turn):.3f} degrees",
         f"inliers      {alignment.inlier_ratio:.1%} of the source within "
         f"{alignment.inlier_distance:.3g} of the target, RMSE {alignment.rmse:.3g}",
-        f"probability  {alignment.success_probability:.3f} that the rotation is right to "
-        f"{SUCCESS_DEG:g} deg",
+        f"probability  {alignment.success_probability:.3f} that the pose is right to "
+        f"{SUCCESS_DEG:g} deg and {SUCCESS_PART:.0%}",
+        *(["alternatives " + str(len(alignment.alternatives))] if alignment.alternatives else []),
         *(f"warning      {for_command_line(warning)}" for warning in alignment.warnings),
         f"time         {sum(alignment.timings.values()):.2f} s ({laps})",
         for_command_line(": ".join(filter(None, (alignment.verdict, alignment.reason)))),

@@ -51,7 +51,7 @@ def run(folder, capsys, monkeypatch):
 
 def likely(monkeypatch, probability: float) -> None:
     """Let the success probability be what a test needs; the tiny network is untrained."""
-    monkeypatch.setattr(ALIGN, "success_probability", lambda *_: probability)
+    monkeypatch.setattr("dbdnet_jax.alignment.finding.success_probability", lambda *_: probability)
 
 
 def test_the_summary_goes_to_stdout_and_progress_to_stderr(run, monkeypatch):
@@ -97,12 +97,14 @@ def test_the_moved_source_is_saved(run, tmp_path):
 
 
 def test_no_refinement_is_asked_for(run, monkeypatch):
-    monkeypatch.setattr(
-        "dbdnet_jax.alignment.search.strongest_alternative", lambda *_: pytest.fail("judged")
-    )
+    def settle(*_, last, **__):
+        assert last is False
+        pytest.fail("judged")
+
+    monkeypatch.setattr("dbdnet_jax.alignment.finding.settle", settle)
     refined = []
     monkeypatch.setattr(
-        "dbdnet_jax.alignment.search.refine", lambda pose, *_: refined.append(1) or pose
+        "dbdnet_jax.alignment.finding.examine", lambda *_: refined.append(1) or pytest.fail()
     )
     with pytest.raises(pytest.fail.Exception, match="judged"):
         run("a.ply", "b.ply", "--no-refine")

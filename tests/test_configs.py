@@ -205,11 +205,14 @@ def test_a_network_of_nothing_is_refused_by_its_field(field):
         read_config(with_change(**{f"model__{field}": 0}))
 
 
-def test_a_missing_field_is_named():
+def test_a_missing_section_is_named_and_a_missing_field_has_its_default():
     config = with_change()
     with config.unlocked():
         del config.train["seed"]
-    with pytest.raises(ValueError, match=r"config must hold|config\.train .* lacks seed"):
+    assert read_config(config).train.seed == TrainConfig().seed
+    with config.unlocked():
+        del config["train"]
+    with pytest.raises(ValueError, match=r"every section of the method dbdnet; it lacks train"):
         read_config(config)
 
 

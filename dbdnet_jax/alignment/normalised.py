@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from dbdnet_jax.alignment.downsampling import UNIT_SIZE, Downsampled, downsample
-from dbdnet_jax.alignment.search import Transform, as_transform, move
+from dbdnet_jax.alignment.surfaces import Surface, surface
+from dbdnet_jax.alignment.transforms import Transform, as_transform, move
 from dbdnet_jax.io.point_files import MIN_POINTS
 
 Points = Float[np.ndarray, "n 3"]
@@ -14,11 +15,11 @@ OtherPoints = Float[np.ndarray, "m 3"]
 
 
 class NormalisedCloud(NamedTuple):
-    """One cloud as given, the rows chosen of it, and these at the network's scale."""
+    """One cloud as given, the rows chosen of it, and these at the network's scale as a surface."""
 
     points: Points
     downsampled: Downsampled
-    dense: Float[np.ndarray, "d 3"]
+    surface: Surface
     sparse: Float[np.ndarray, "s 3"]
 
 
@@ -58,10 +59,9 @@ def normalise_pair(
         )
 
     def side(points, rows, turn):
-        dense, sparse = (
-            (points[x] - rows.centre) @ turn.T * factor for x in (rows.dense, rows.sparse)
-        )
-        return NormalisedCloud(points, rows, dense, sparse)
+        dense = (points[rows.dense] - rows.centre) @ turn.T * factor
+        sparse = dense[rows.even[: len(rows.sparse)]]
+        return NormalisedCloud(points, rows, surface(dense, rows.even), sparse)
 
     return NormalisedPair(
         side(source, downsampled[0], guess[:3, :3]),
@@ -71,12 +71,12 @@ def normalise_pair(
     )
 
 
-def normalised_guess(scene: NormalisedPair) -> Transform:
-    """The guess where the source has been turned by it already: a translation."""
-    start = np.eye(4)
-    moved = move(scene.guess, scene.source.downsampled.centre)
-    start[:3, 3] = (moved - scene.target.downsampled.centre) * scene.factor
-    return start
+def as_normalised(transform: Transform, scene: NormalisedPair) -> Transform:
+    """A transform of the clouds as given as a pose of the scene; undoes `as_given`."""
+    pose = as_transform(transform[:3, :3] @ scene.guess[:3, :3].T, np.zeros(3))
+    moved = move(transform, scene.source.downsampled.centre)
+    pose[:3, 3] = (moved - scene.target.downsampled.centre) * scene.factor
+    return pose
 
 
 def as_given(pose: Transform, scene: NormalisedPair) -> Transform:
@@ -90,7 +90,9 @@ def as_given(pose: Transform, scene: NormalisedPair) -> Transform:
 def is_full_resolution(scene: NormalisedPair) -> bool:
     """Whether a pose is judged on all points of both clouds, but for outliers."""
     sides = scene.source, scene.target
-    return all(len(side.dense) + side.downsampled.outliers == len(side.points) for side in sides)
+    return all(
+        len(side.surface.points) + side.downsampled.outliers == len(side.points) for side in sides
+    )
 
 
 def size_ratio(scene: NormalisedPair) -> float:

@@ -44,5 +44,9 @@ def as_json(alignment: Alignment) -> dict[str, Any]:
         "rmse": alignment.rmse if np.isfinite(alignment.rmse) else None,
         "information": alignment.information.tolist(),
         "pivot": alignment.pivot.tolist(),
+        "alternatives": [
+            other._asdict() | {"transform": other.transform.tolist()}
+            for other in alignment.alternatives
+        ],
         "seconds": alignment.timings,
     }

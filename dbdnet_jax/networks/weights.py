@@ -122,11 +122,6 @@ def read_model(method: str, fields: Mapping[str, Any], owner: str) -> Any:
         raise CheckpointError(f"{owner}: the configuration cannot be built: {error}") from error
 
 
-def load_metadata(path: str | Path) -> dict[str, Any]:
-    """The free-form metadata of a file of weights; errors as in ``load_params``."""
-    return _read(path)[0]["metadata"]
-
-
 def load_pretrained(name: str = "cad") -> Params:
     """The weights of that name that come with the package.
 

@@ -85,20 +85,9 @@ def _require_known(given: Mapping[str, Any], known: Mapping[str, Any], where: st
 
 
 def read_record(record: type, section: Mapping[str, Any], where: str) -> Any:
-    """``record`` from a mapping with exactly its fields; nested records from nested mappings."""
+    """``record`` from a mapping of its fields, the others at their defaults; nested ones alike."""
     types = typing.get_type_hints(record)
     _require_known(section, types, where, f"the fields of {record.__name__}")
-    optional = {
-        field.name
-        for field in dataclasses.fields(record)
-        if field.default is not dataclasses.MISSING
-    }
-    missing = [name for name in types if name not in section and name not in optional]
-    if missing:
-        raise ValueError(
-            f"{where} must hold every field of {record.__name__}; it lacks {', '.join(missing)}. "
-            "Start from a config in configs/ and state only the differences."
-        )
     values = {
         name: _read_value(types[name], value, f"{where}.{name}") for name, value in section.items()
     }
@@ -142,7 +131,7 @@ def _read_value(kind: Any, value: Any, where: str) -> Any:
         raise ValueError(
             f"{where} must be finite and below {LARGEST:g}; got {value!r:.60}. Give such a number."
         )
-    return value
+    return float(value) if kind is float else value
 
 
 def stage_record(config: RunConfig, stage: str) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from tests.aligning import tiny_params
 from tests.conftest import random_cloud
 from tests.test_structure import imported_names
 
-NOT_TRACED = {"programs", "files", "forks", "quality", "errors"}
+NOT_TRACED = {"programs", "files", "forks", "surfaces", "transforms", "errors"}
 EXAMPLES = Path(__file__).parents[2] / "examples"
 BUCKETS = {192, 384, 768, 1536}
 

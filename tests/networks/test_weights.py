@@ -13,7 +13,7 @@ from dbdnet_jax.networks import weights
 from dbdnet_jax.networks.dbdnet.config import ModelConfig, check_field
 from dbdnet_jax.networks.params import unflatten
 from dbdnet_jax.networks.table import parameter_shapes
-from dbdnet_jax.networks.weights import CheckpointError, load_metadata, load_params, save_params
+from dbdnet_jax.networks.weights import CheckpointError, load_params, save_params
 from tests.torch_files import save_zip, tensor
 
 CONFIG = ModelConfig(
@@ -73,11 +73,11 @@ def test_the_round_trip_is_exact(tmp_path, networks):
     loaded = load_params(tmp_path / "w.npz")
     assert same(loaded, params) and loaded.config == CONFIG
     assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(loaded))
-    assert load_metadata(tmp_path / "w.npz") == {}
 
 
-def test_metadata_comes_back(path):
-    assert load_metadata(path) == {"data": "CAD", "steps": 3}
+def test_metadata_stands_in_the_header(path):
+    header = json.loads(str(members(path)["header"]))
+    assert header["metadata"] == {"data": "CAD", "steps": 3}
 
 
 def test_the_same_weights_give_the_same_file(path, tmp_path):
@@ -240,9 +240,8 @@ def test_a_header_of_wrong_types_or_out_of_bounds_is_refused(path, field, value)
 )
 def test_a_header_that_is_none_is_refused(path, header):
     rewrite(path, members(path) | {"header": np.array(header)}, valid=True)
-    for read in (load_params, load_metadata):
-        with pytest.raises(CheckpointError, match=r"w\.npz: the (header|format) must"):
-            read(path)
+    with pytest.raises(CheckpointError, match=r"w\.npz: the (header|format) must"):
+        load_params(path)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300])
