@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from dbdnet_jax.metrics.pose import rotation_error_deg, translation_error
 from dbdnet_jax.networks.batch_norm import split_batch_stats
-from dbdnet_jax.networks.dcp.network import DCP, DCPConfig, match, predict
+from dbdnet_jax.networks.dcp.network import DCP, DCPConfig, match, predict_pose
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.training.start import initial_params
 from dbdnet_jax.training.task import RunConfig, Task, check_stage
@@ -70,16 +70,16 @@ def loss_of_batch(
     )
     pose = match(*features, pairs.source, pairs.target).target_from_source
     terms = pose_loss(pose, pairs.target_from_source)
-    return sum(terms), (terms, changed["batch_stats"])
+    return jnp.sum(jnp.stack(terms)), (terms, changed["batch_stats"])
 
 
 def validate(
     model: DCPConfig, weights: Any, frozen: None, pair: Pair
 ) -> dict[str, Float[Array, ""]]:
     """The loss of one pair, and what it means in degrees."""
-    pose = predict(Params({"dcp": weights}, model), pair.source, pair.target).motion
+    pose = predict_pose(Params({"dcp": weights}, model), pair.source, pair.target)
     return {
-        "error": sum(pose_loss(pose, pair.target_from_source)),
+        "error": jnp.sum(jnp.stack(pose_loss(pose, pair.target_from_source))),
         "rotation_deg": rotation_error_deg(pose, pair.target_from_source),
         "translation": translation_error(pose, pair.target_from_source),
     }

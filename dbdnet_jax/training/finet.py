@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from dbdnet_jax.metrics.pose import rotation_error_deg, translation_error
 from dbdnet_jax.networks.batch_norm import split_batch_stats
 from dbdnet_jax.networks.chains import pose_terms, quaternion_pose
-from dbdnet_jax.networks.finet.network import SENSITIVE, FINet, FINetConfig, Turn, predict
+from dbdnet_jax.networks.finet.network import SENSITIVE, FINet, FINetConfig, Turn, predict_pose
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.training.start import initial_params
 from dbdnet_jax.training.task import RunConfig, Task, check_stage
@@ -113,15 +113,15 @@ def loss_of_batch(
         mutable=["batch_stats"],
     )
     terms = [turn_losses(turn, i, pairs.target_from_source, stage) for i, turn in enumerate(turns)]
-    total = FINetTerms(*(sum(term) for term in zip(*terms, strict=True)))
-    return sum(total), (total, changed["batch_stats"])
+    total = FINetTerms(*(jnp.sum(jnp.stack(term)) for term in zip(*terms, strict=True)))
+    return jnp.sum(jnp.stack(total)), (total, changed["batch_stats"])
 
 
 def validate(
     model: FINetConfig, weights: Any, frozen: None, pair: Pair
 ) -> dict[str, Float[Array, ""]]:
     """The authors' score: angle in degrees / 100 plus distance."""
-    pose = predict(Params({"finet": weights}, model), pair.source, pair.target).motion
+    pose = predict_pose(Params({"finet": weights}, model), pair.source, pair.target)
     degrees = rotation_error_deg(pose, pair.target_from_source)
     distance = translation_error(pose, pair.target_from_source)
     return {"error": 0.01 * degrees + distance, "rotation_deg": degrees, "translation": distance}

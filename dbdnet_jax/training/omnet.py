@@ -70,12 +70,12 @@ def labels(
     Points masked out are nobody's counterpart, and have none.
     """
     points = move(truth, source.points), target.points
-    near, far = (
+    of_source, of_target = (
         jnp.where(mask[..., None], x, place)
         for x, mask, place in zip(points, masks, MASKED_OUT, strict=True)
     )
-    square = over_pairs(squared_distances, near)(near, far)
-    return tuple(jnp.min(square, axis=axis) < radius**2 for axis in (-1, -2))
+    near = over_pairs(squared_distances, of_source)(of_source, of_target) < radius**2
+    return jnp.any(near, axis=-1), jnp.any(near, axis=-2)
 
 
 def class_loss(
@@ -97,7 +97,9 @@ def turn_losses(
         class_loss(logits, overlap) for logits, overlap in zip(turn.logits, overlaps, strict=True)
     ]
     rotation, translation = pose_terms(turn.pose, quaternion_pose(truth))
-    return OMNetTerms(sum(of_classes) / 2, rotation, TRANSLATION_WEIGHT * translation)
+    return OMNetTerms(
+        (of_classes[0] + of_classes[1]) / 2, rotation, TRANSLATION_WEIGHT * translation
+    )
 
 
 def loss_of_batch(
@@ -121,8 +123,8 @@ def loss_of_batch(
     terms = [
         turn_losses(turn, pairs.source, pairs.target, truth, stage.overlap_radius) for turn in turns
     ]
-    total = OMNetTerms(*(sum(term) for term in zip(*terms, strict=True)))
-    return sum(total), (total, changed["batch_stats"])
+    total = OMNetTerms(*(jnp.sum(jnp.stack(term)) for term in zip(*terms, strict=True)))
+    return jnp.sum(jnp.stack(total)), (total, changed["batch_stats"])
 
 
 def validate(
@@ -130,6 +132,7 @@ def validate(
 ) -> dict[str, Float[Array, ""]]:
     """The authors' score: angle in degrees / 100 plus distance; and the overlap's error."""
     answer = predict(Params({"omnet": weights}, model), pair.source, pair.target)
+    assert answer.motion is not None  # OMNet's answers have one
     degrees = rotation_error_deg(answer.motion, pair.target_from_source)
     distance = translation_error(answer.motion, pair.target_from_source)
     counts = pair_confusion(answer.source_overlap, answer.target_overlap, pair)

@@ -14,12 +14,12 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from dbdnet_jax.metrics.pose import rotation_error_deg, translation_error
 from dbdnet_jax.networks.batch_norm import split_batch_stats
 from dbdnet_jax.networks.params import Params
-from dbdnet_jax.networks.rienet.network import RIENet, RIENetConfig, Turn, predict
+from dbdnet_jax.networks.rienet.network import RIENet, RIENetConfig, Turn, predict_pose
 from dbdnet_jax.networks.stacking import move, over_pairs, rows
 from dbdnet_jax.ops.grouping import squared_distances
 from dbdnet_jax.training.start import initial_params
 from dbdnet_jax.training.task import RunConfig, Task, check_stage
-from dbdnet_jax.types import Cloud, Pair, Rigid
+from dbdnet_jax.types import Cloud, Pair
 
 SMALLEST_SCORE = 1e-15  # its logarithm is finite
 
@@ -99,7 +99,7 @@ def turn_losses(
 
 def total_terms(terms: list[RIENetTerms]) -> RIENetTerms:
     """The terms of all turns."""
-    return RIENetTerms(*(sum(term) for term in zip(*terms, strict=True)))
+    return RIENetTerms(*(jnp.sum(jnp.stack(term)) for term in zip(*terms, strict=True)))
 
 
 def loss_of_batch(
@@ -125,14 +125,14 @@ def loss_of_batch(
             for turn in turns
         ]
     )
-    return sum(terms), (terms, changed["batch_stats"])
+    return jnp.sum(jnp.stack(terms)), (terms, changed["batch_stats"])
 
 
 def validate(
     model: RIENetConfig, weights: Any, frozen: None, pair: Pair
 ) -> dict[str, Float[Array, ""]]:
     """Angle in radians plus distance."""
-    pose: Rigid = predict(Params({"rienet": weights}, model), pair.source, pair.target).motion
+    pose = predict_pose(Params({"rienet": weights}, model), pair.source, pair.target)
     degrees = rotation_error_deg(pose, pair.target_from_source)
     distance = translation_error(pose, pair.target_from_source)
     return {

@@ -138,7 +138,12 @@ def shapes(config: DCPConfig) -> Shapes:
 
 def predict(params: Params, source: Cloud, target: Cloud) -> Answer:
     """The pose of one pair; DCP predicts no overlap."""
+    return Answer(predict_pose(params, source, target))
+
+
+def predict_pose(params: Params, source: Cloud, target: Cloud) -> Rigid:
+    """The pose of one pair."""
     variables = {"params": fold(params.networks["dcp"])}
     clean = [without_padding(cloud) for cloud in (source, target)]
     features = DCP(params.config).apply(variables, *clean)
-    return Answer(match(*features, *clean).target_from_source)
+    return match(*features, *clean).target_from_source

@@ -204,6 +204,11 @@ def shapes(config: FINetConfig) -> Shapes:
 
 def predict(params: Params, source: Cloud, target: Cloud) -> Answer:
     """The pose of one pair; FINet predicts no overlap."""
+    return Answer(predict_pose(params, source, target))
+
+
+def predict_pose(params: Params, source: Cloud, target: Cloud) -> Rigid:
+    """The pose of one pair."""
     variables = {"params": fold(params.networks["finet"])}
     clean = [without_padding(cloud) for cloud in (source, target)]
-    return Answer(FINet(params.config).apply(variables, *clean)[-1].pose.rigid)
+    return FINet(params.config).apply(variables, *clean)[-1].pose.rigid

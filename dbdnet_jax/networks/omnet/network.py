@@ -50,18 +50,19 @@ class OMNetConfig:
 
 
 class Turn(NamedTuple):
-    """One turn; pairs of arrays are the source's and the target's.
+    """One turn; two arrays are the source's and the target's.
 
-    ``pose`` includes this turn's ``increment``; ``masks`` are those that it was given.
+    ``pose`` includes this turn's ``increment``; ``logits`` are of the points' classes,
+    ``masks`` those that it was given, ``own``, ``fused`` features of points, ``pooled`` of clouds.
     """
 
     increment: QuaternionPose
     pose: QuaternionPose
-    logits: tuple[Float[Array, "*pairs n 2"], Float[Array, "*pairs m 2"]]
+    logits: list[Array]
     masks: tuple[Bool[Array, "*pairs n"], Bool[Array, "*pairs m"]]
-    own: tuple[Float[Array, "*pairs n c"], Float[Array, "*pairs m c"]]
-    pooled: tuple[Float[Array, "*pairs d"], Float[Array, "*pairs d"]]
-    fused: tuple[Float[Array, "*pairs n e"], Float[Array, "*pairs m e"]]
+    own: list[Array]
+    pooled: list[Array]
+    fused: list[Array]
     regressed: Float[Array, "*pairs f"]
 
 
@@ -82,10 +83,8 @@ class OMNet(nn.Module):
             valid = source.valid, target.valid
             masks = valid
             if i >= DELAY:
-                masks = tuple(
-                    (logits[..., 1] > logits[..., 0]) & present
-                    for logits, present in zip(turns[-1].logits, valid, strict=True)
-                )
+                chosen = [logits[..., 1] > logits[..., 0] for logits in turns[-1].logits]
+                masks = chosen[0] & valid[0], chosen[1] & valid[1]
             turn = _Turn(self.config, name=f"turn_{i}")(
                 (points, target.points), masks, pose, training
             )
@@ -112,14 +111,14 @@ class _Turn(nn.Module):
         decoder = Chain(config.decoder, name="decoder")
         classes = Rows(CLASSES, name="classes")
         layers = [encoder(points, training) for points in clouds]
-        own = tuple(
+        own = [
             zero_padding(x[config.kept - 1], mask) for x, mask in zip(layers, masks, strict=True)
-        )
+        ]
         # Masked rows are zeros, the floor of a ReLU; so is the feature of an empty mask.
-        pooled = tuple(
+        pooled = [
             jnp.max(zero_padding(x[-1], mask), axis=-2)
             for x, mask in zip(layers, masks, strict=True)
-        )
+        ]
         fused, logits, regressed = [], [], []
         for c in (0, 1):
             wide = [to_every_row(x, own[c].shape[-2]) for x in (pooled[c], pooled[1 - c])]
@@ -135,7 +134,7 @@ class _Turn(nn.Module):
         found = Rows(7, name="pose")(last)
         increment = QuaternionPose(unit(found[..., :4]), found[..., 4:])
         pose = after(increment, pose)
-        return Turn(increment, pose, tuple(logits), masks, own, pooled, tuple(fused), both)
+        return Turn(increment, pose, logits, masks, own, pooled, fused, both)
 
 
 def shapes(config: OMNetConfig) -> Shapes:
@@ -160,8 +159,8 @@ def predict(params: Params, source: Cloud, target: Cloud) -> Answer:
     variables = {"params": fold(params.networks["omnet"])}
     clean = [without_padding(cloud) for cloud in (source, target)]
     last = OMNet(params.config).apply(variables, *clean)[-1]
-    overlaps = (
+    source_overlap, target_overlap = (
         jnp.where(cloud.valid, jax.nn.softmax(logits, axis=-1)[..., 1], 0.0)
-        for cloud, logits in zip(clean, last.logits, strict=True)
+        for cloud, logits in zip((source, target), last.logits, strict=True)
     )
-    return Answer(last.pose.rigid, *overlaps)
+    return Answer(last.pose.rigid, source_overlap, target_overlap)

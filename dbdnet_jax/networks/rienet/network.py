@@ -155,7 +155,12 @@ def shapes(config: RIENetConfig) -> Shapes:
 
 def predict(params: Params, source: Cloud, target: Cloud) -> Answer:
     """The pose of one pair; the confidences are no probabilities of overlap."""
+    return Answer(predict_pose(params, source, target))
+
+
+def predict_pose(params: Params, source: Cloud, target: Cloud) -> Rigid:
+    """The pose of one pair."""
     variables = {"params": fold(params.networks["rienet"])}
     clean = [without_padding(cloud) for cloud in (source, target)]
     turns, _ = RIENet(params.config).apply(variables, *clean)
-    return Answer(pose_of(turns))
+    return pose_of(turns)

@@ -62,10 +62,10 @@ def _confidence_entries(width: int) -> dict[str, Entry]:
     layers = [
         ("edge_0", f"{stem}1", 0, 3, width, 2),
         ("edge_1", f"{stem}1", 3, width, 2 * width, 2),
-        ("weight_0", f"{stem}2", 0, 2 * width, BRANCH, 2),
-        ("weight_1", f"{stem}2", 3, BRANCH, BRANCH, 2),
-        ("value_0", f"{stem}3", 0, 2 * width, BRANCH, 2),
-        ("value_1", f"{stem}3", 3, BRANCH, BRANCH, 2),
+        ("value_0", f"{stem}2", 0, 2 * width, BRANCH, 2),
+        ("value_1", f"{stem}2", 3, BRANCH, BRANCH, 2),
+        ("weight_0", f"{stem}3", 0, 2 * width, BRANCH, 2),
+        ("weight_1", f"{stem}3", 3, BRANCH, BRANCH, 2),
         ("head_0", f"{stem}4", 0, BRANCH, HEAD, 1),
     ]
     for name, theirs, place, fan_in, features, axes in layers:
