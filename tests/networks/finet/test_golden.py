@@ -124,7 +124,7 @@ def check_sensitivity(turn, mode, margin, i, relative):
 @pytest.mark.parametrize(("mode", "margin"), [("eval", 0.01), ("eval_margin1", 1.0)])
 def test_evaluation(mode, margin):
     params, pair, truth = given()
-    gradient, (terms, turns) = jax.jit(jax.grad(evaluated, has_aux=True), static_argnums=1)(
+    gradient, (terms, turns) = jax.jit(jax.grad(evaluated, has_aux=True), static_argnums=(1, 4))(
         params.networks["finet"], params.config, pair, truth, margin
     )
     arrays = bundle("finet")
