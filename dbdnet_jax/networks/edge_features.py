@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from dbdnet_jax.networks.batch_norm import DenseBatchNorm, dense_batch_norm_shapes
 from dbdnet_jax.networks.params import Shapes
-from dbdnet_jax.networks.stacking import rows
+from dbdnet_jax.networks.stacking import pool_edges, rows
 
 
 class EdgeFeatures(nn.Module):
@@ -40,7 +40,7 @@ class EdgeFeatures(nn.Module):
         kept = []
         for i, width in enumerate(self.widths):
             edges = DenseBatchNorm(width, bias=False, name=f"edge_{i}")(edges, training)
-            kept.append(jnp.max(edges, axis=-2))
+            kept.append(pool_edges(edges))
         layer = DenseBatchNorm(self.features, bias=False, name="point")
         return layer(jnp.concatenate(kept, axis=-1), training)
 

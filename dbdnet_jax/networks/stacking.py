@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from dbdnet_jax.ops import rigid
-from dbdnet_jax.ops.grouping import knn
+from dbdnet_jax.ops.grouping import knn, masked_max, max_over_slots
 from dbdnet_jax.types import Cloud, Rigid
 
 
@@ -43,6 +43,18 @@ def move(target_from_source: Rigid, points: Float[Array, "*pairs n 3"]) -> Array
 def zero_padding(x: Float[Array, "*pairs n c"], valid: Bool[Array, "*pairs n"]) -> Array:
     """Features with zeros in the padding: the floor of a ReLU, which no maximum notices."""
     return jnp.where(valid[..., None], x, 0.0)
+
+
+def pool(x: Float[Array, "*pairs n c"], valid: Bool[Array, "*pairs n"]) -> Array:
+    """`ops.grouping.masked_max`, of each pair: where there is no row, zeros, a ReLU's floor."""
+    return over_pairs(masked_max, x)(x, valid)
+
+
+def pool_edges(edges: Float[Array, "*rows k c"]) -> Float[Array, "*rows c"]:
+    """`ops.grouping.max_over_slots`, of every row's k edges."""
+    k, c = edges.shape[-2:]
+    slots = jnp.moveaxis(edges.reshape(-1, k, c), 1, 0)
+    return max_over_slots(slots).reshape(*edges.shape[:-2], c)
 
 
 def without_padding(cloud: Cloud) -> Cloud:

@@ -7,7 +7,7 @@ from jaxtyping import Array, Bool
 
 from dbdnet_jax.networks.chains import Chain, chain_shapes
 from dbdnet_jax.networks.params import Shapes
-from dbdnet_jax.networks.stacking import to_every_row, zero_padding
+from dbdnet_jax.networks.stacking import pool, to_every_row
 from dbdnet_jax.types import Cloud
 
 BRANCHES = ("rotation", "translation")
@@ -31,24 +31,24 @@ class TwoBranches(nn.Module):
         valid = jnp.concatenate([source.valid, target.valid], axis=-1)
         n, m = source.points.shape[-2], target.points.shape[-2]
 
-        def pool(x, present):
-            x = zero_padding(x, present)
-            return jnp.stack([jnp.max(x[..., :n, :], -2), jnp.max(x[..., n:, :], -2)], axis=-2)
+        def pool_clouds(x, present):
+            both = (x[..., :n, :], present[..., :n]), (x[..., n:, :], present[..., n:])
+            return jnp.stack([pool(*cloud) for cloud in both], axis=-2)
 
         pooled, dropped = [], []
         for branch in BRANCHES:
             x, kept = points, []
             for part, widths in enumerate(self.widths):
                 if part:
-                    other = jax.lax.stop_gradient(pool(x, valid))
+                    other = jax.lax.stop_gradient(pool_clouds(x, valid))
                     told = [to_every_row(other[..., 1, :], n), to_every_row(other[..., 0, :], m)]
                     x = jnp.concatenate([x, jnp.concatenate(told, axis=-2)], axis=-1)
                 kept += Chain(widths, bias=False, name=f"{branch}_{part}")(x, training)
                 x = kept[-1]
             together = jnp.concatenate(kept, axis=-1)
-            pooled.append(pool(together, valid))
+            pooled.append(pool_clouds(together, valid))
             if keep is not None:
-                dropped.append(pool(together, valid & keep))
+                dropped.append(pool_clouds(together, valid & keep))
         return pooled, None if keep is None else dropped
 
 

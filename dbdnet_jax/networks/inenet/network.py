@@ -17,7 +17,7 @@ from dbdnet_jax.networks.batch_norm import DenseBatchNorm, dense_batch_norm_shap
 from dbdnet_jax.networks.blocks import affine_shapes
 from dbdnet_jax.networks.chains import Chain, chain_shapes
 from dbdnet_jax.networks.params import Params, Shapes
-from dbdnet_jax.networks.stacking import Rows, over_pairs, without_padding, zero_padding
+from dbdnet_jax.networks.stacking import Rows, over_pairs, pool, without_padding, zero_padding
 from dbdnet_jax.types import Answer, Cloud
 
 HEAD_SLOPE = 0.01  # of the leaky ReLUs behind the encoder
@@ -88,7 +88,7 @@ class _Transform(nn.Module):
     def __call__(self, x: Array, valid: Array, training: bool) -> Array:
         width = x.shape[-1]
         x = Chain(self.config.transform, name="points")(x, training)[-1]
-        x = jnp.max(zero_padding(x, valid), axis=-2)
+        x = pool(x, valid)
         x = Chain(self.config.transform_head, name="cloud")(x, training)[-1]
         x = Rows(width * width, name="matrix")(x).reshape(*x.shape[:-1], width, width)
         return x + jnp.broadcast_to(jnp.eye(width, dtype=x.dtype), x.shape)

@@ -16,7 +16,14 @@ from dbdnet_jax.networks.batch_norm import fold
 from dbdnet_jax.networks.blocks import affine_shapes
 from dbdnet_jax.networks.chains import Chain, QuaternionPose, after, chain_shapes, no_motion, unit
 from dbdnet_jax.networks.params import Params, Shapes
-from dbdnet_jax.networks.stacking import Rows, move, to_every_row, without_padding, zero_padding
+from dbdnet_jax.networks.stacking import (
+    Rows,
+    move,
+    pool,
+    to_every_row,
+    without_padding,
+    zero_padding,
+)
 from dbdnet_jax.types import Answer, Cloud
 
 CLASSES = 2  # of a point: without and with a counterpart
@@ -114,11 +121,8 @@ class _Turn(nn.Module):
         own = [
             zero_padding(x[config.kept - 1], mask) for x, mask in zip(layers, masks, strict=True)
         ]
-        # Masked rows are zeros, the floor of a ReLU; so is the feature of an empty mask.
-        pooled = [
-            jnp.max(zero_padding(x[-1], mask), axis=-2)
-            for x, mask in zip(layers, masks, strict=True)
-        ]
+        # The feature of an empty mask is zeros, the floor of a ReLU, as masked rows are in theirs.
+        pooled = [pool(x[-1], mask) for x, mask in zip(layers, masks, strict=True)]
         fused, logits, regressed = [], [], []
         for c in (0, 1):
             wide = [to_every_row(x, own[c].shape[-2]) for x in (pooled[c], pooled[1 - c])]
@@ -127,8 +131,8 @@ class _Turn(nn.Module):
         for c in (0, 1):
             decoded = decoder(fused[c], training)
             logits.append(classes(decoded[-1]))
-            seen = [fused[c], *(zero_padding(x, masks[c]) for x in decoded)]
-            regressed.append(jnp.max(jnp.concatenate(seen, axis=-1), axis=-2))
+            seen = [fused[c], *decoded]
+            regressed.append(pool(jnp.concatenate(seen, axis=-1), masks[c]))
         both = jnp.concatenate(regressed, axis=-1)
         last = Chain(config.regression, name="regression")(both, training)[-1]
         found = Rows(7, name="pose")(last)
