@@ -156,7 +156,7 @@ def test_an_unknown_test_set_is_refused():
 
 
 def test_a_perturbed_pose_turns_about_the_middle_of_the_cloud(pairs):
-    pair = jax.tree.map(lambda leaf: leaf[0], pairs)
+    pair = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), pairs)
     for key in jax.random.split(jax.random.key(9), 4):
         found = perturbed_pose(key, pair, max_angle_deg=60.0, shift_sigma=0.0)
         ends = (rigid.apply(x, pair.source.points) for x in (found, pair.target_from_source))
