@@ -68,7 +68,8 @@ def loss_of_batch(
         training=True,
         mutable=["batch_stats"],
     )
-    pose = match(*features, pairs.source, pairs.target).target_from_source
+    source, target = features
+    pose = match(source, target, pairs.source, pairs.target).target_from_source
     terms = pose_loss(pose, pairs.target_from_source)
     return jnp.sum(jnp.stack(terms)), (terms, changed["batch_stats"])
 
@@ -80,7 +81,7 @@ def validate(
     pose = predict_pose(Params({"dcp": weights}, model), pair.source, pair.target)
     return {
         "error": jnp.sum(jnp.stack(pose_loss(pose, pair.target_from_source))),
-        "rotation_deg": rotation_error_deg(pose, pair.target_from_source),
+        "rotation_deg": rotation_error_deg(pose.rotation, pair.target_from_source.rotation),
         "translation": translation_error(pose, pair.target_from_source),
     }
 

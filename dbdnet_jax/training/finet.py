@@ -86,7 +86,8 @@ def turn_losses(turn: Turn, number: int, truth: Rigid, stage: FINetStage) -> FIN
     rotation, translation = pose_terms(turn.pose, quaternion_pose(truth))
     sensitivity = jnp.zeros_like(rotation)
     if number < SENSITIVE:
-        sensitivity = stage.sensitivity * sum(sensitivity_losses(turn, stage.margin))
+        losses = jnp.stack(sensitivity_losses(turn, stage.margin))
+        sensitivity = stage.sensitivity * jnp.sum(losses)
     dropout = DROPOUT_WEIGHT * jnp.sum(dropout_losses(turn))
     return FINetTerms(rotation, TRANSLATION_WEIGHT * translation, sensitivity, dropout)
 
@@ -122,7 +123,7 @@ def validate(
 ) -> dict[str, Float[Array, ""]]:
     """The authors' score: angle in degrees / 100 plus distance."""
     pose = predict_pose(Params({"finet": weights}, model), pair.source, pair.target)
-    degrees = rotation_error_deg(pose, pair.target_from_source)
+    degrees = rotation_error_deg(pose.rotation, pair.target_from_source.rotation)
     distance = translation_error(pose, pair.target_from_source)
     return {"error": 0.01 * degrees + distance, "rotation_deg": degrees, "translation": distance}
 

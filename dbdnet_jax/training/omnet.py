@@ -132,8 +132,9 @@ def validate(
 ) -> dict[str, Float[Array, ""]]:
     """The authors' score: angle in degrees / 100 plus distance; and the overlap's error."""
     answer = predict(Params({"omnet": weights}, model), pair.source, pair.target)
-    assert answer.motion is not None  # OMNet's answers have one
-    degrees = rotation_error_deg(answer.motion, pair.target_from_source)
+    assert answer.motion is not None  # OMNet's answers are whole
+    assert answer.source_overlap is not None and answer.target_overlap is not None
+    degrees = rotation_error_deg(answer.motion.rotation, pair.target_from_source.rotation)
     distance = translation_error(answer.motion, pair.target_from_source)
     counts = pair_confusion(answer.source_overlap, answer.target_overlap, pair)
     return {

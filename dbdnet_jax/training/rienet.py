@@ -133,7 +133,7 @@ def validate(
 ) -> dict[str, Float[Array, ""]]:
     """Angle in radians plus distance."""
     pose = predict_pose(Params({"rienet": weights}, model), pair.source, pair.target)
-    degrees = rotation_error_deg(pose, pair.target_from_source)
+    degrees = rotation_error_deg(pose.rotation, pair.target_from_source.rotation)
     distance = translation_error(pose, pair.target_from_source)
     return {
         "error": jnp.deg2rad(degrees) + distance,

@@ -47,7 +47,7 @@ def entries(config: DCPConfig) -> dict[str, Entry]:
 
 
 def _layer_entries(config: DCPConfig, half: str, kinds: tuple[str, ...]) -> dict[str, Entry]:
-    found = {}
+    found: dict[str, Entry] = {}
     ours, theirs = f"dcp/pointer_{half}", f"pointer.model.{half}"
     width = config.features
     for block in range(config.blocks):

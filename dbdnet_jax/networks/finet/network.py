@@ -6,7 +6,7 @@ in size. There is no mask.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -211,4 +211,5 @@ def predict_pose(params: Params, source: Cloud, target: Cloud) -> Rigid:
     """The pose of one pair."""
     variables = {"params": fold(params.networks["finet"])}
     clean = [without_padding(cloud) for cloud in (source, target)]
-    return FINet(params.config).apply(variables, *clean)[-1].pose.rigid
+    turns: Any = FINet(params.config).apply(variables, *clean)
+    return turns[-1].pose.rigid

@@ -6,7 +6,7 @@ of points only, and their order matters.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -207,7 +207,7 @@ def predict(params: Params, source: Cloud, target: Cloud) -> Answer:
     clean = [without_padding(cloud) for cloud in (source, target)]
 
     def overlap(cloud: Cloud, other: Cloud) -> Array:
-        found = INENet(config).apply(variables, cloud, as_channels(other, config))
+        found: Any = INENet(config).apply(variables, cloud, as_channels(other, config))
         return jnp.where(cloud.valid, 0.5 + 0.5 * found.margin, 0.0)
 
     return Answer(None, overlap(*clean), overlap(*clean[::-1]))

@@ -5,7 +5,7 @@ released code needs clouds of equal sizes; nothing in the mathematics does, so t
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax
@@ -162,7 +162,8 @@ def predict(params: Params, source: Cloud, target: Cloud) -> Answer:
     """The pose of one pair, and the overlap that the last turn sees."""
     variables = {"params": fold(params.networks["omnet"])}
     clean = [without_padding(cloud) for cloud in (source, target)]
-    last = OMNet(params.config).apply(variables, *clean)[-1]
+    turns: Any = OMNet(params.config).apply(variables, *clean)
+    last = turns[-1]
     source_overlap, target_overlap = (
         jnp.where(cloud.valid, jax.nn.softmax(logits, axis=-1)[..., 1], 0.0)
         for cloud, logits in zip((source, target), last.logits, strict=True)
