@@ -26,7 +26,7 @@ from dbdnet_jax.alignment.success import (
     success_probability,
 )
 from dbdnet_jax.alignment.validity import rejection_reason, warnings
-from dbdnet_jax.io.point_files import read_points
+from dbdnet_jax.io.point_files import read_point_file
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import load_pretrained
 
@@ -100,7 +100,7 @@ def align(
     """Find the motion that brings ``source`` onto ``target``.
 
     Args:
-      source: (n, 3) numbers, n >= 16, or a file; see `point_files.read_points`.
+      source: (n, 3) numbers, n >= 16, or a file; see `point_files.read_point_file`.
       target: the same, (m, 3), in the same unit.
       params: the network; the weights in the package, if None.
       refine: refine the network's pose, from it and from near it, on up to 1,024 points of each
@@ -120,7 +120,8 @@ def align(
     laps = {"start": time.perf_counter()}
     _check_arguments(scale, overlap_threshold, max_points)
     guess = np.eye(4) if initial is None else _check_transform(initial)
-    given = read_points(source, "source", seed=seed), read_points(target, "target", seed=seed + 1)
+    source = read_point_file(source, "source", seed=seed)
+    target = read_point_file(target, "target", seed=seed + 1)
     laps["read"] = time.perf_counter()
     params = load_pretrained() if params is None else params
     if params.overlap is None or params.registration is None:
@@ -128,7 +129,7 @@ def align(
     config = dataclasses.replace(params.config, overlap_threshold=float(overlap_threshold))
     params = dataclasses.replace(params, config=config)
     laps["weights"] = time.perf_counter()
-    scene = normalise_pair(*given, scale, max_points, guess)
+    scene = normalise_pair(source.points, target.points, scale, max_points, guess)
     laps["downsample"] = time.perf_counter()
     predicted = search.predict_pose(params, scene.source.sparse, scene.target.sparse)
     laps["network"] = time.perf_counter()
@@ -138,7 +139,9 @@ def align(
         starts.append(normalised_guess(scene))
     pose = _select_pose(starts, scene, refine)
     laps["refine"] = time.perf_counter()
-    return _report(scene, predicted, pose, distance, laps)
+    found = _report(scene, predicted, pose, distance, laps)
+    notes = (*source.notes, *target.notes)
+    return dataclasses.replace(found, warnings=(*notes, *found.warnings)) if notes else found
 
 
 def _select_pose(starts: list[Transform], scene: NormalisedPair, refine: bool) -> Transform:
