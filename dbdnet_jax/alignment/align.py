@@ -23,7 +23,7 @@ from dbdnet_jax.alignment.success import PoseFeatures, load_coefficients
 from dbdnet_jax.alignment.transforms import Transform, as_transform
 from dbdnet_jax.alignment.validity import rejection_reason, warnings
 from dbdnet_jax.io.forks import require_own_jax
-from dbdnet_jax.io.point_files import read_points
+from dbdnet_jax.io.point_files import read_point_file
 from dbdnet_jax.io.programs import loading_seconds
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import load_pretrained
@@ -117,7 +117,7 @@ def align(
     """Find the motion that brings ``source`` onto ``target``.
 
     Args:
-      source: (n, 3) numbers, n >= 16, or a file; see `point_files.read_points`.
+      source: (n, 3) numbers, n >= 16, or a file; see `point_files.read_point_file`.
       target: the same, (m, 3), in the same unit.
       params: the network; the weights in the package, if None.
       refine: refine poses. Without, the network's pose (or a better one of those given) is the
@@ -145,16 +145,13 @@ def align(
     _check_arguments(search, scale, overlap_threshold, max_points)
     guess = np.eye(4) if initial is None else _check_transform(initial)
     proposed = [_check_transform(x, f"proposals[{i}]") for i, x in enumerate(proposals)]
-    given = read_points(source, "source", seed=seed), read_points(target, "target", seed=seed + 1)
+    source = read_point_file(source, "source", seed=seed)
+    target = read_point_file(target, "target", seed=seed + 1)
     laps["read"] = _clock()
-    params = load_pretrained() if params is None else params
-    if params.overlap is None or params.registration is None:
-        raise ValueError("params must hold both networks; one is None. Load a full set of weights.")
-    config = dataclasses.replace(params.config, overlap_threshold=float(overlap_threshold))
-    params = dataclasses.replace(params, config=config)
+    params = _with_threshold(params, overlap_threshold)
     coefficients = load_coefficients()
     laps["weights"] = _clock()
-    scene = normalise_pair(*given, scale, max_points, guess)
+    scene = normalise_pair(source.points, target.points, scale, max_points, guess)
     laps["downsample"] = _clock()
     found = finding.find_pose(
         params,
@@ -170,11 +167,25 @@ def align(
     if not reason and refine:
         reason = finding.mirror_reason(scene, found, coefficients)
     laps["quality"] = _clock()
-    return _report(scene, found, reason, laps, loaded)
+    return _report(scene, found, reason, (*source.notes, *target.notes), laps, loaded)
+
+
+def _with_threshold(params: Params | None, overlap_threshold: float) -> Params:
+    """The network, or that of the package, with a threshold of its own."""
+    params = load_pretrained() if params is None else params
+    if params.overlap is None or params.registration is None:
+        raise ValueError("params must hold both networks; one is None. Load a full set of weights.")
+    config = dataclasses.replace(params.config, overlap_threshold=float(overlap_threshold))
+    return dataclasses.replace(params, config=config)
 
 
 def _report(
-    scene: NormalisedPair, found: Found, reason: str, laps: dict[str, float], loaded: float
+    scene: NormalisedPair,
+    found: Found,
+    reason: str,
+    notes: tuple[str, ...],
+    laps: dict[str, float],
+    loaded: float,
 ) -> Alignment:
     """Everything that is known of a pose, in the units and rows of the clouds as given."""
     quality = found.quality
@@ -189,7 +200,7 @@ def _report(
         valid=not reason,
         reason=reason,
         success_probability=found.probability,
-        warnings=tuple(warnings(scene, found)),
+        warnings=(*notes, *warnings(scene, found)),
         inlier_ratio=float(quality.inlier.mean()),
         inlier_distance=quality.distance / scene.factor,
         rmse=quality.rmse / scene.factor,
