@@ -135,10 +135,10 @@ def test_a_folder_of_pairs_goes_by_names(run, folder, tmp_path):
 @pytest.mark.parametrize(
     ("error", "message"),
     [
-        (MemoryError("Unable to allocate 9 GiB"), "error: out of memory: Unable to allocate 9 GiB"),
+        (MemoryError("Unable to allocate 9 GiB"), "out of memory: Unable to allocate 9 GiB"),
         (RuntimeError("RESOURCE_EXHAUSTED: no room\nmore"), "out of memory: RESOURCE_EXHAUSTED"),
         (TypeError("a bug\x1b[2J"), r"unexpected TypeError: a bug\x1b[2J. DBDNET_DEBUG=1 shows"),
-        (RecursionError("too deep"), "error: unexpected RecursionError: too deep"),
+        (RecursionError("too deep"), "unexpected RecursionError: too deep"),
     ],
 )
 def test_an_unexpected_error_costs_its_pair_alone(run, tmp_path, monkeypatch, error, message):

@@ -11,7 +11,20 @@ import pytest
 from ml_collections import ConfigDict
 
 from configs import cad, cad_short, modelnet, threedmatch
-from configs.peers import masknet, masknet_cad
+from configs.peers import (
+    dcp,
+    dcp_cad,
+    finet,
+    finet_cad,
+    inenet,
+    inenet_cad,
+    masknet,
+    masknet_cad,
+    omnet,
+    omnet_cad,
+    rienet,
+    rienet_cad,
+)
 from dbdnet_jax.data.pairs import Protocol
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.masknet.network import MaskNetConfig
@@ -23,7 +36,22 @@ from dbdnet_jax.training.task import RunConfig, TrainConfig
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = {"modelnet": modelnet, "threedmatch": threedmatch, "cad": cad, "cad_short": cad_short}
-PEERS = {"masknet": masknet, "masknet_cad": masknet_cad}
+PEERS = {
+    "masknet": masknet,
+    "dcp": dcp,
+    "rienet": rienet,
+    "omnet": omnet,
+    "finet": finet,
+    "inenet": inenet,
+}
+PEERS |= {
+    "masknet_cad": masknet_cad,
+    "dcp_cad": dcp_cad,
+    "rienet_cad": rienet_cad,
+    "omnet_cad": omnet_cad,
+    "finet_cad": finet_cad,
+    "inenet_cad": inenet_cad,
+}
 
 
 def train(*arguments: str) -> subprocess.CompletedProcess:

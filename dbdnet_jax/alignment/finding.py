@@ -112,7 +112,7 @@ def settle(
         network_angle=math.log1p(angle_between(final.pose, predicted.transform)[0]),
         last_step_angle=math.log1p(angle_between(final.pose, chosen.pose)[0]),
         ambiguity_margin=margin,
-        ambiguity_count=sum(alike),
+        ambiguity_count=float(sum(alike)),
         turn=math.log1p(angle_between(final.pose, np.eye(4))[0]),
         everywhere=float(everywhere),
     )

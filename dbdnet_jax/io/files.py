@@ -17,13 +17,11 @@ def cache_folder(name: str) -> Path | None:
     """
     try:
         base = _cache_home()
-        if base.is_dir():
-            _refuse_foreign(base, owned=False)
-        for folder in (base / "dbdnet_jax", base / "dbdnet_jax" / name):
+        for folder in (base, base / "dbdnet_jax", base / "dbdnet_jax" / name):
             if not folder.is_dir():
                 folder.mkdir(mode=0o700, parents=True, exist_ok=True)
                 folder.chmod(0o700)  # whatever the umask
-            _refuse_foreign(folder)
+            _refuse_foreign(folder, owned=folder != base)
     except (OSError, ValueError) as error:
         warn_without_cache(str(error))
         return None

@@ -104,8 +104,9 @@ def test_too_few_points_for_the_network_are_refused():
 def test_half_a_network_is_refused():
     from dbdnet_jax.alignment.align import align
 
+    half = tiny_params().replace(networks={"registration": tiny_params().registration})
     with pytest.raises(ValueError, match="params must hold both networks"):
-        align(SOURCE, TARGET, tiny_params().replace(overlap=None))
+        align(SOURCE, TARGET, half)
 
 
 LINE = np.linspace(-1, 1, 200)[:, None] * [1.0, 2.0, 0.5]
