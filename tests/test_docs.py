@@ -13,7 +13,7 @@ import pytest
 from dbdnet_jax.cli import _parser
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 NOTEBOOK = ROOT / "notebooks" / "quick_start.ipynb"
 OURS = r"(configs|examples|tests|tools|benchmarks|docs)/[^_]"  # folders; docs/_build is made
 
@@ -126,7 +126,10 @@ def test_tests_and_files_that_a_page_names_exist(page):
         assert any(f"def {name}(" in source for source in sources.values()), name
     for name in re.findall(r"`((?:dbdnet_jax|configs|tools|examples|docs)/[\w./]+)`", text):
         assert (ROOT / name).exists(), name
-    for name in re.findall(r"`((?:model|ops|data|alignment)/\w+\.py)`", text):
+    for name in re.findall(
+        r"`((?:classical|data|alignment|evaluation|io|metrics|networks|ops|training)/[\w/]+\.py)`",
+        text,
+    ):
         assert (ROOT / "dbdnet_jax" / name).exists(), name
 
 

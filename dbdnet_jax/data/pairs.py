@@ -124,8 +124,9 @@ def assemble(
     source = moved + draw.source_noise
     target = points[draw.target_rows] + draw.target_noise
     target_from_source = rigid.invert(draw.source_from_target)
-    overlap = _overlap_labels(rigid.apply(target_from_source, source), target, overlap_radius)
     size = jnp.asarray(source.shape[0])
+    aligned = Cloud(rigid.apply(target_from_source, source), size)
+    overlap = _overlap_labels(aligned, Cloud(target, size), overlap_radius)
     return Pair(
         source=Cloud(source, size),
         target=Cloud(target, size),
@@ -143,13 +144,12 @@ def perturbed_pose(
     """The true motion, then a turn about the source's centroid and a shift.
 
     Both grow with one uniform number, up to the angle and the shift's deviation per component.
-    Clouds without padding only.
     """
     amount_key, direction_key = jax.random.split(key)
     amount = jax.random.uniform(amount_key)
     axis, shift = jax.random.normal(direction_key, (2, 3))
     turn = rigid.rotation_about(axis / jnp.linalg.norm(axis), amount * math.radians(max_angle_deg))
-    centre = jnp.mean(rigid.apply(pair.target_from_source, pair.source.points), axis=0)
+    centre = rigid.apply(pair.target_from_source, _centroid(pair.source)[None])[0]
     shift = centre - turn @ centre + amount * shift_sigma * shift
     return rigid.compose(Rigid(turn, shift), pair.target_from_source)
 
@@ -161,7 +161,7 @@ def initial_pose(key: PRNGKeyArray, pair: Pair) -> Rigid:
     """
     choice_key, motion_key = jax.random.split(key)
     roughly = perturbed_pose(motion_key, pair, max_angle_deg=40.0, shift_sigma=0.2)
-    shift = jnp.mean(pair.target.points, axis=0) - jnp.mean(pair.source.points, axis=0)
+    shift = _centroid(pair.target) - _centroid(pair.source)
     blind = jax.random.uniform(choice_key) < 0.4
     return jax.tree.map(
         lambda a, b: jnp.where(blind, a, b), Rigid(jnp.eye(3, dtype=shift.dtype), shift), roughly
@@ -179,12 +179,13 @@ def perturbed_overlap(
     choice_key, motion_key = jax.random.split(key)
     choice = jax.random.uniform(choice_key)
     motion = perturbed_pose(motion_key, pair, max_angle_deg=30.0, shift_sigma=0.1)
-    aligned = rigid.apply(motion, pair.source.points)
-    labels = _overlap_labels(aligned, pair.target.points, overlap_radius)
+    aligned = pair.source._replace(points=rigid.apply(motion, pair.source.points))
+    labels = _overlap_labels(aligned, pair.target, overlap_radius)
     truth = pair.source_overlap, pair.target_overlap
+    valid = pair.source.valid, pair.target.valid
     source, target = (
-        jnp.where(choice < 0.2, true, (choice < 0.4) | label)
-        for true, label in zip(truth, labels, strict=True)
+        jnp.where(choice < 0.2, true, (choice < 0.4) | label) & rows
+        for true, label, rows in zip(truth, labels, valid, strict=True)
     )
     return source, target
 
@@ -197,8 +198,15 @@ def transform_source(pair: Pair, motion: Rigid) -> Pair:
 
 
 def _overlap_labels(
-    aligned: Float[Array, "n 3"], target: Float[Array, "m 3"], radius: float
+    aligned: Cloud, target: Cloud, radius: float
 ) -> tuple[Bool[Array, " n"], Bool[Array, " m"]]:
     """Which points have a neighbour in the other cloud closer than ``radius``, once aligned."""
-    near = squared_distances(aligned, target) < radius * radius
+    near = squared_distances(aligned.points, target.points) < radius * radius
+    near &= aligned.valid[:, None] & target.valid[None, :]
     return jnp.any(near, axis=1), jnp.any(near, axis=0)
+
+
+def _centroid(cloud: Cloud) -> Float[Array, "3"]:
+    """The mean of the valid points."""
+    points = jnp.where(cloud.valid[:, None], cloud.points, 0.0)
+    return jnp.sum(points, axis=0) / jnp.maximum(cloud.count, 1)

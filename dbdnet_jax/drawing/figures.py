@@ -1,6 +1,6 @@
 """Interactive figures: clouds in space, a histogram, and curves.
 
-A figure's text may hold simple HTML, so words from outside are escaped by whoever hands them over.
+A figure's text may hold simple HTML, so words from outside are escaped on their way into it.
 """
 
 from collections.abc import Sequence
@@ -106,6 +106,7 @@ def residuals(drawn: DrawnPair, inlier_distance: float) -> "Figure":
 
 def curves(lines: Sequence[Curve], x: str, y: str, mode: str, **axis: Any) -> "Figure":
     """Lines over a common axis; ``mode`` is "lines" or "lines+markers", ``axis`` of the x axis."""
+    from markupsafe import escape
     from plotly.graph_objects import Figure, Scatter
 
     def look(line: Curve) -> dict[str, Any]:
@@ -115,10 +116,13 @@ def curves(lines: Sequence[Curve], x: str, y: str, mode: str, **axis: Any) -> "F
         return {"color": colour, "width": 1.5, "dash": DASHES[line.place % len(DASHES)]}
 
     figure = Figure(
-        [Scatter(x=line.x, y=line.y, name=line.name, mode=mode, line=look(line)) for line in lines]
+        [
+            Scatter(x=line.x, y=line.y, name=str(escape(line.name)), mode=mode, line=look(line))
+            for line in lines
+        ]
     )
-    figure.update_xaxes(title_text=x, **axis)
-    figure.update_yaxes(title_text=y, rangemode="tozero")
+    figure.update_xaxes(title_text=str(escape(x)), **axis)
+    figure.update_yaxes(title_text=str(escape(y)), rangemode="tozero")
     return _flat(figure, legend=BELOW)
 
 

@@ -76,6 +76,7 @@ def run_task(
         kind=train.schedule,
         milestones=[round(epoch * epoch_steps) for epoch in train.milestones],
         factor=train.factor,
+        decay_steps=round(train.decay_epochs * epoch_steps),
     )
     optimizer = make_optimizer(
         schedule,

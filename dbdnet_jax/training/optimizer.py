@@ -14,11 +14,13 @@ def make_schedule(
     kind: str = "cosine",
     milestones: Sequence[int] = (),
     factor: float = 0.1,
+    decay_steps: int = 0,
 ) -> optax.Schedule:
     """Linear warm-up to ``peak``, then what ``kind`` says.
 
     "cosine" ends at 0 after ``steps``; "steps" multiplies the rate by ``factor`` from each of the
-    ``milestones`` (steps) on; "constant" keeps it.
+    ``milestones`` (steps) on; "constant" keeps it until the last ``decay_steps``, over which a
+    cosine ends at 0: more steps then change nothing of those before.
     """
     warmup_steps = min(warmup_steps, steps - 1)
     first = peak / (warmup_steps + 1)  # not 0: the first step counts too
@@ -30,7 +32,9 @@ def make_schedule(
     def rate(step):
         passed = sum(jnp.asarray(step >= milestone, jnp.float32) for milestone in milestones)
         warm = jnp.minimum(1.0, (step + 1) / (warmup_steps + 1)) if warmup_steps > 0 else 1.0
-        return peak * warm * jnp.asarray(factor, jnp.float32) ** passed
+        left = jnp.clip((steps - step) / decay_steps, 0.0, 1.0) if decay_steps else 1.0
+        decay = 0.5 - 0.5 * jnp.cos(jnp.pi * left)
+        return peak * warm * decay * jnp.asarray(factor, jnp.float32) ** passed
 
     return rate
 

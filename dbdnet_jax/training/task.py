@@ -11,6 +11,7 @@ from dbdnet_jax.data.config import DataConfig
 from dbdnet_jax.data.pairs import Protocol
 
 OPTIMIZERS = ("adamw", "adam")
+LARGEST_BATCH = 2**16  # pairs of a step, all of which are in memory
 SCHEDULES = ("cosine", "constant", "steps")
 
 
@@ -53,7 +54,8 @@ class TrainConfig:
     start from ("": fresh ones). ``batch_size`` and ``learning_rate`` are what the stages' own
     fields follow until set. ``optimizer`` "adam" adds the weight decay to the gradient, as torch's
     Adam does, "adamw" does not. ``schedule`` "cosine" ends at 0; "steps" multiplies the rate by
-    ``factor`` after each of the ``milestones`` (epochs); either, and "constant", may warm up.
+    ``factor`` after each of the ``milestones`` (epochs); "constant" falls to 0 by a cosine over the
+    last ``decay_epochs`` only, so that such a run may be prolonged or cut short. All may warm up.
     """
 
     seed: int = 0
@@ -65,6 +67,7 @@ class TrainConfig:
     schedule: str = "cosine"
     milestones: tuple[float, ...] = ()
     factor: float = 0.1
+    decay_epochs: float = 0.0
     warmup_epochs: float = 5.0
     clip_norm: float = 0.0  # global norm of a network's gradient
     ema_decay: float = 0.0  # of the moving average of the weights, which then is what is kept
@@ -86,6 +89,28 @@ class TrainConfig:
             raise ValueError(
                 "config.train.milestones must be given for schedule='steps', and for it alone; got "
                 f"{self.milestones} for {self.schedule!r}. Change one of the two."
+            )
+        if self.decay_epochs and self.schedule != "constant":
+            raise ValueError(
+                "config.train.decay_epochs must be 0 but for schedule='constant'; got "
+                f"{self.decay_epochs} for {self.schedule!r}. Change one of the two."
+            )
+        for name in (
+            "weight_decay",
+            "decay_epochs",
+            "warmup_epochs",
+            "clip_norm",
+            "devices",
+            "seed",
+        ):
+            if getattr(self, name) < 0:
+                raise ValueError(
+                    f"config.train.{name} must not be negative; got {getattr(self, name)}. Use 0."
+                )
+        _check_steps("train", self)
+        if not 0 <= self.ema_decay < 1:
+            raise ValueError(
+                f"config.train.ema_decay must be in [0, 1); got {self.ema_decay}. Use 0 for none."
             )
         for name in ("log_every", "validate_every", "checkpoint_every", "validation_pairs"):
             value = getattr(self, name)
@@ -117,8 +142,18 @@ class RunConfig:
 
 def check_stage(name: str, stage: Any) -> None:
     """Refuse a stage of nothing."""
-    if stage.epochs <= 0 or stage.batch_size < 1:
+    if stage.epochs <= 0:
+        raise ValueError(f"config.{name}.epochs must be positive; got {stage.epochs}. Use 1.")
+    _check_steps(name, stage)
+
+
+def _check_steps(name: str, section: Any) -> None:
+    if not 1 <= section.batch_size <= LARGEST_BATCH:
         raise ValueError(
-            f"config.{name} must have epochs > 0 and batch_size >= 1; got epochs={stage.epochs}, "
-            f"batch_size={stage.batch_size}."
+            f"config.{name}.batch_size must be from 1 to {LARGEST_BATCH}; got "
+            f"{section.batch_size}. Use 8."
+        )
+    if section.learning_rate <= 0:
+        raise ValueError(
+            f"config.{name}.learning_rate must be positive; got {section.learning_rate}. Use 1e-4."
         )

@@ -20,6 +20,7 @@ from dbdnet_jax.training.table import STAGES as TRAINED
 from tests.conftest import assert_close
 from tests.golden import (
     GRADIENT_NORM,
+    IS_WHOLE,
     LOSS,
     MARKS,
     TRAJECTORY,
@@ -28,6 +29,7 @@ from tests.golden import (
     pairs,
     released_params,
 )
+from tools.cut_golden import POINTNET
 
 pytestmark = MARKS
 
@@ -84,7 +86,9 @@ def test_the_losses_of_five_steps(stage, numbers):
     losses, expected = trained(stage, numbers).losses, golden()[f"{stage}/loss_trajectory"]
     assert losses.dtype == np.float64
     assert_close(losses[0], expected[0], LOSS)
-    assert_close(losses, expected, TRAJECTORY)
+    assert_close(
+        losses[: len(expected)], expected, TRAJECTORY
+    )  # the part holds one of registration
 
 
 def test_each_term_of_the_registration_loss():
@@ -100,6 +104,7 @@ def test_the_gradient_of_every_parameter(stage, numbers):
         gradient = gradient.replace(networks={"overlap": gradient.overlap})
     by_name = to_released(gradient)
     expected = below(f"{stage}/grad_norm/")
-    assert len(expected) == len(jax.tree.leaves(getattr(gradient, stage)))
+    left_out = 0 if IS_WHOLE or stage == "overlap" else len(below(f"state_dict/{POINTNET}"))
+    assert len(expected) == len(jax.tree.leaves(getattr(gradient, stage))) - left_out
     found = [np.linalg.norm(by_name[name].astype(np.float64)) for name in expected]
     assert_close(np.stack(found), np.stack(list(expected.values())), GRADIENT_NORM)

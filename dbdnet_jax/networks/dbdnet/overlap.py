@@ -38,7 +38,11 @@ class OverlapNetwork(nn.Module):
 
     @nn.compact
     def __call__(
-        self, clouds: Cloud, pyramids: Pyramid, dropout_key: PRNGKeyArray | None = None
+        self,
+        clouds: Cloud,
+        pyramids: Pyramid,
+        dropout_key: PRNGKeyArray | None = None,
+        geometry: Float[Array, "2 n g"] | None = None,
     ) -> tuple[Float[Array, "2 n"], SoftMatches | None]:
         """Logits of the points of two clouds, stacked, each in farthest-point order.
 
@@ -48,7 +52,7 @@ class OverlapNetwork(nn.Module):
         """
         config = self.config
         encoder = Encoder(config.overlap_channels, config.neighbour_space, name="encoder")
-        features = over_clouds(encoder, clouds.points, pyramids)
+        features = over_clouds(encoder, clouds.points, pyramids, geometry)
         n, width = features.shape[1:]
         features = features + jax.vmap(lambda x: position_code(x, width))(clouds.points)
         valid = clouds.valid
@@ -75,7 +79,7 @@ class OverlapNetwork(nn.Module):
 def overlap_shapes(config: ModelConfig) -> Shapes:
     """The parameters of an `OverlapNetwork`."""
     width = 4 * config.overlap_channels
-    shapes = encoder_shapes("overlap/encoder", config.overlap_channels)
+    shapes = encoder_shapes("overlap/encoder", config.overlap_channels, config.inputs)
     shapes |= attention_shapes("overlap/attention", config.overlap_blocks, width)
     fan_in = 2 * width
     if config.overlap_matching:

@@ -9,7 +9,9 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.dbdnet.frames import (
     centre_and_order,
+    geometry_of,
     move_source,
+    reordered,
     truncate_rows,
     uncentred,
 )
@@ -32,6 +34,7 @@ class PreparedPair(NamedTuple):
     order: Int[Array, "2 n"]
     ordered: Cloud  # all points in that order
     nearest: tuple[Array, Array] | None  # of all points among the seen ones, to interpolate
+    geometry: Float[Array, "2 m g"] | None  # of all points, in the clouds' own row order
 
 
 def prepare_pair(config: ModelConfig, clouds: Cloud) -> PreparedPair:
@@ -42,7 +45,8 @@ def prepare_pair(config: ModelConfig, clouds: Cloud) -> PreparedPair:
     nearest = None
     if seen.points.shape[1] < ordered.points.shape[1]:
         nearest = jax.vmap(interpolation_weights)(ordered.points, seen.points, seen.count)
-    return PreparedPair(seen, centroid, pyramids, order, ordered, nearest)
+    geometry = geometry_of(clouds, config)
+    return PreparedPair(seen, centroid, pyramids, order, ordered, nearest, geometry)
 
 
 def apply_overlap_network(
@@ -55,7 +59,9 @@ def apply_overlap_network(
     network = OverlapNetwork(params.config)
     moved = move_source(prepared.seen, start)
     variables = {"params": params.overlap}
-    answer: Any = network.apply(variables, moved, prepared.pyramids, dropout_key)
+    rows = prepared.order[:, : moved.points.shape[1]]
+    geometry = reordered(prepared.geometry, rows)
+    answer: Any = network.apply(variables, moved, prepared.pyramids, dropout_key, geometry)
     logits, matched = answer
     if matched is not None:
         own = prepared.seen._replace(points=prepared.seen.points + prepared.centroid[:, None, :])

@@ -80,16 +80,20 @@ class RegistrationNetwork(nn.Module):
         clouds: Cloud,
         skip_rows: Int[Array, "2 n"] | None = None,
         dropout_key: PRNGKeyArray | None = None,
+        geometry: Float[Array, "2 n g"] | None = None,
     ) -> Float[Array, "2 n n"]:
         """Encode, then match."""
-        return self.match(clouds, self.encode(clouds, skip_rows), dropout_key)
+        return self.match(clouds, self.encode(clouds, skip_rows, geometry), dropout_key)
 
     def encode(
-        self, clouds: Cloud, skip_rows: Int[Array, "2 n"] | None = None
+        self,
+        clouds: Cloud,
+        skip_rows: Int[Array, "2 n"] | None = None,
+        geometry: Float[Array, "2 n g"] | None = None,
     ) -> Float[Array, "2 n d"]:
         """Point-wise features of two stacked clouds, each in farthest-point order."""
         pyramids = build_pyramids(clouds, self.config.neighbours, skip_rows)
-        return over_clouds(self.encoder, clouds.points, pyramids)
+        return over_clouds(self.encoder, clouds.points, pyramids, geometry)
 
     def match(
         self,
@@ -135,7 +139,7 @@ def registration_shapes(config: ModelConfig) -> Shapes:
     width = 4 * config.registration_channels
     last = config.point_layers[-1][0]
     return {
-        **encoder_shapes("registration/encoder", config.registration_channels),
+        **encoder_shapes("registration/encoder", config.registration_channels, config.inputs),
         **attention_shapes("registration/attention", config.shared_blocks, width),
         **attention_shapes("registration/attention_R", config.rotation_blocks, width),
         **attention_shapes("registration/attention_t", config.translation_blocks, width),
