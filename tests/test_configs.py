@@ -143,17 +143,11 @@ def test_threedmatch_is_the_papers():
     config = read_config(threedmatch.get_config())
     assert config.model == ModelConfig()
     assert (config.protocol.points, config.protocol.overlap_radius) == (2048, 0.0375)
-    assert (config.stages["overlap"].epochs, config.stages["overlap"].batch_size) == (150, 2)
-    assert (config.stages["registration"].epochs, config.stages["registration"].batch_size) == (
-        50,
-        1,
-    )
-    assert config.stages["registration"].weights == LossWeights(rotation=5.0)
-    assert (
-        config.stages["overlap"].learning_rate
-        == config.stages["registration"].learning_rate
-        == 1e-4
-    )
+    overlap, registration = config.stages["overlap"], config.stages["registration"]
+    assert (overlap.epochs, overlap.batch_size) == (150, 2)
+    assert (registration.epochs, registration.batch_size) == (50, 1)
+    assert registration.weights == LossWeights(rotation=5.0)
+    assert overlap.learning_rate == registration.learning_rate == 1e-4
 
 
 def test_the_cad_configurations_keep_the_papers_protocol():
