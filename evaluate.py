@@ -25,8 +25,8 @@ from dbdnet_jax.evaluation.methods import Weights
 from dbdnet_jax.evaluation.run import evaluate
 from dbdnet_jax.evaluation.sweep import SWEEP_PAIRS, SWEEPS, render_sweep, save_sweep, sweep
 from dbdnet_jax.evaluation.tables import render, save
-from dbdnet_jax.io.files import write_atomic
-from dbdnet_jax.io.programs import keep_compiled_programs
+from dbdnet_jax.io.files import require_writable, write_atomic
+from dbdnet_jax.io.programs import keep_compiled_programs, require_device
 from dbdnet_jax.networks.weights import PRETRAINED, load_named
 from dbdnet_jax.training.checkpoint import load_best, was_trained
 from dbdnet_jax.training.config import parse_flags, read_config
@@ -96,6 +96,8 @@ def main(argv: list[str]) -> None:
     config_name = Path(config_flags.get_config_filename(flags.FLAGS["config"])).stem
     run_dir = Path(RUN_DIR.value or Path("runs") / config_name)
     try:
+        require_writable(run_dir)
+        require_device()
         if REPORT.value:
             require_drawing()
         config = read_config(CONFIG.value)
@@ -109,13 +111,13 @@ def main(argv: list[str]) -> None:
             command=shlex.join(["python", *sys.argv]),
             count=COUNT.value,
         )
+        print(render(evaluation))
+        save(evaluation, run_dir)
+        if REPORT.value:
+            page = run_dir / f"evaluation_{evaluation.pair_set}.html"
+            write_atomic(page, evaluation_page(evaluation, run_dir))
     except (ValueError, OSError, MissingExtraError) as error:
         sys.exit(f"error: {error}")
-    print(render(evaluation))
-    save(evaluation, run_dir)
-    if REPORT.value:
-        page = run_dir / f"evaluation_{evaluation.pair_set}.html"
-        write_atomic(page, evaluation_page(evaluation, run_dir))
 
 
 if __name__ == "__main__":

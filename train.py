@@ -22,7 +22,7 @@ from dbdnet_jax.data.training_pairs import load_training_pairs
 from dbdnet_jax.evaluation.methods import Weights
 from dbdnet_jax.evaluation.run import evaluate
 from dbdnet_jax.evaluation.tables import render, save
-from dbdnet_jax.io.programs import keep_compiled_programs
+from dbdnet_jax.io.programs import keep_compiled_programs, require_device
 from dbdnet_jax.networks.table import LEARNED
 from dbdnet_jax.networks.weights import save_params
 from dbdnet_jax.training.checkpoint import JOINT, load_best
@@ -67,6 +67,7 @@ def main(argv: list[str]) -> None:
         devices = config.train.devices or min(os.cpu_count() or 1, pairs)
         jax.config.update("jax_num_cpu_devices", devices)
         keep_compiled_programs()
+        require_device()
         for stage in stages:
             stream = load_training_pairs(
                 config.data,

@@ -1,7 +1,11 @@
-"""Libraries that only an extra of the package brings, and what to say where they are missing."""
+"""Files that cannot be read, and libraries that only an extra of the package brings."""
 
 import importlib.util
 from types import ModuleType
+
+
+class CheckpointError(ValueError):
+    """A file that cannot be read: refused, damaged, or not what its reader expects."""
 
 
 class MissingExtraError(ImportError):

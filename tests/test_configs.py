@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +11,20 @@ import pytest
 from ml_collections import ConfigDict
 
 from configs import cad, cad_short, modelnet, threedmatch
-from configs.peers import masknet, masknet_cad
+from configs.peers import (
+    dcp,
+    dcp_cad,
+    finet,
+    finet_cad,
+    inenet,
+    inenet_cad,
+    masknet,
+    masknet_cad,
+    omnet,
+    omnet_cad,
+    rienet,
+    rienet_cad,
+)
 from dbdnet_jax.data.pairs import Protocol
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.masknet.network import MaskNetConfig
@@ -22,7 +36,22 @@ from dbdnet_jax.training.task import RunConfig, TrainConfig
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = {"modelnet": modelnet, "threedmatch": threedmatch, "cad": cad, "cad_short": cad_short}
-PEERS = {"masknet": masknet, "masknet_cad": masknet_cad}
+PEERS = {
+    "masknet": masknet,
+    "dcp": dcp,
+    "rienet": rienet,
+    "omnet": omnet,
+    "finet": finet,
+    "inenet": inenet,
+}
+PEERS |= {
+    "masknet_cad": masknet_cad,
+    "dcp_cad": dcp_cad,
+    "rienet_cad": rienet_cad,
+    "omnet_cad": omnet_cad,
+    "finet_cad": finet_cad,
+    "inenet_cad": inenet_cad,
+}
 
 
 def train(*arguments: str) -> subprocess.CompletedProcess:
@@ -159,11 +188,11 @@ def test_a_stage_may_resume_only_with_what_decides_its_outcome():
         ({"data__name": "modelnet"}, r"one of \('cad', 'modelnet40', 'threedmatch'\); got 'mod"),
         ({"train__log_every": 30}, r"validate_every must be a multiple of .*log_every = 30"),
         ({"train__validation_pairs": 0}, r"validation_pairs must be at least 1; got 0"),
-        ({"overlap__epochs": 0.0}, r"config\.overlap must have epochs > 0"),
+        ({"overlap__epochs": 0.0}, r"config\.overlap\.epochs must be positive; got 0"),
         ({"method": "icp"}, r"config\.method must be one of dbdnet, masknet.*; got 'icp'"),
         ({"train__optimizer": "sgd"}, r"optimizer must be one of \('adamw', 'adam'\); got 'sgd'"),
         ({"train__schedule": "steps"}, r"milestones must be given for schedule='steps'"),
-        ({"joint__batch_size": 0}, r"config\.joint must have .*; got epochs=8.0, batch_size=0"),
+        ({"joint__batch_size": 0}, r"config\.joint\.batch_size must be from 1 .*; got 0"),
         (
             {"data__augment": 1.5},
             r"config\.data\.augment must be in \[0, 1\].*; got 1\.5 for 'cad'",
@@ -177,11 +206,41 @@ def test_a_wrong_configuration_is_refused(changes, message):
         read_config(with_change(**changes))
 
 
-def test_a_missing_field_is_named():
+def leaves(section: ConfigDict, *path: str) -> list[tuple[str, ...]]:
+    """The dotted names of all fields, as tuples."""
+    found = []
+    for name, value in section.items():
+        inside = isinstance(value, ConfigDict)
+        found += leaves(value, *path, name) if inside else [(*path, name)]
+    return found
+
+
+@pytest.mark.parametrize("path", leaves(cad.get_config()), ids=".".join)
+def test_every_field_refuses_what_is_no_number_and_other_types(path):
+    for value in (float("nan"), float("inf"), -float("inf"), 1e300, None, [1], {"a": 1}, b"x"):
+        config = cad.get_config().to_dict()
+        section = config
+        for name in path[:-1]:
+            section = section[name]
+        section[path[-1]] = value
+        with pytest.raises(ValueError, match=rf"{re.escape('.'.join(path))} must be .*; got"):
+            read_config(ConfigDict(config))
+
+
+@pytest.mark.parametrize("field", ["heads", "neighbours", "overlap_channels", "iterations"])
+def test_a_network_of_nothing_is_refused_by_its_field(field):
+    with pytest.raises(ValueError, match=rf"in config\.model: {field} must be from"):
+        read_config(with_change(**{f"model__{field}": 0}))
+
+
+def test_a_missing_section_is_named_and_a_missing_field_has_its_default():
     config = with_change()
     with config.unlocked():
         del config.train["seed"]
-    with pytest.raises(ValueError, match=r"config must hold|config\.train .* lacks seed"):
+    assert read_config(config).train.seed == TrainConfig().seed
+    with config.unlocked():
+        del config["train"]
+    with pytest.raises(ValueError, match=r"every section of the method dbdnet; it lacks train"):
         read_config(config)
 
 
@@ -189,6 +248,8 @@ def test_a_missing_field_is_named():
     ("arguments", "message"),
     [
         (["--config=configs/cad.py", "--config.train.batchsize=4"], 'Did you mean "batch_size"'),
+        (["--config=configs/cad.py", "--config.model.heads=0"], "heads must be from 1"),
+        (["--config=configs/cad.py", "--config.train.learning_rate=nan"], "learning_rate must be"),
         (["--config=configs/cad.py", "--stage=masknet"], "one of overlap, registration, joint for"),
         (["--config=configs/nothing.py"], "there is none at configs/nothing.py"),
         (["--config=configs/modelnet.py", "--config.data.folder=/nowhere"], "none at /nowhere"),
@@ -196,6 +257,8 @@ def test_a_missing_field_is_named():
     ],
     ids=[
         "misspelt field",
+        "no heads",
+        "no number",
         "stage of another method",
         "no such configuration",
         "no such folder",

@@ -175,7 +175,7 @@ def _scans(
     options: dict[str, Any] = {
         "points": protocol.points,
         "radius_m": protocol.overlap_radius,
-        "cache": cache_folder() / "threedmatch",
+        "cache": cache_folder("threedmatch"),
     }
     count = min(validation_pairs, len(validation))
     rows = [i * len(validation) // count for i in range(count)]

@@ -12,7 +12,7 @@ from dbdnet_jax.drawing.figures import Curve
 from dbdnet_jax.drawing.page import Plot, render
 from dbdnet_jax.evaluation.run import Evaluation, Row
 from dbdnet_jax.evaluation.sweep import SWEEPS
-from dbdnet_jax.evaluation.tables import Table, tables
+from dbdnet_jax.evaluation.tables import tables
 
 LEAST_DEG, LEAST_UNIT = 1e-2, 1e-4  # where the logarithmic axes begin
 
@@ -24,7 +24,7 @@ def evaluation_page(evaluation: Evaluation, run_dir: str | Path) -> bytes:
         "evaluation.html.jinja",
         evaluation=evaluation,
         best=_best(evaluation),
-        tables=[_with_whole_heads(shown) for shown in tables(evaluation)],
+        tables=tables(evaluation),
         charts=[*_distributions(evaluation, places), *_sweeps(Path(run_dir), places)],
         examples=_examples(evaluation),
     )
@@ -48,11 +48,6 @@ def network_row(evaluation: Evaluation) -> Row | None:
         if row.traits.learned and not row.traits.untrained and row.summary is not None:
             return row
     return None
-
-
-def _with_whole_heads(shown: Table) -> Table:
-    """The lines of each head as one text."""
-    return shown._replace(heads=["\n".join(filter(None, head)) for head in shown.heads])
 
 
 def _distributions(evaluation: Evaluation, places: dict[str, int]) -> Iterator[Plot]:
@@ -108,7 +103,8 @@ def _read_sweep(path: Path, name: str, places: dict[str, int]) -> tuple[list[Cur
         Curve(
             method,
             places.get(method, place),
-            *zip(*points, strict=True),
+            [x for x, _ in points],
+            [y for _, y in points],
             learned=learned[method],
         )
         for place, (method, points) in enumerate(found.items(), len(places))

@@ -157,7 +157,7 @@ def from_align(params: Params) -> Answering:
 
     def method(pair: Pair) -> Answer:
         found = align(_points(pair.source), _points(pair.target), params)
-        motion = Rigid(*(np.asarray(x, np.float32) for x in (found.rotation, found.translation)))
+        motion = Rigid(jnp.float32(found.rotation), jnp.float32(found.translation))
         overlap = (
             np.pad(np.asarray(values, np.float32), (0, len(cloud.points) - len(values)))
             for values, cloud in (

@@ -176,5 +176,6 @@ def _pair(pairs: Pair, i: int) -> Pair:
 def _score(answer: Answer, pair: Pair) -> _Scored:
     motion, source, target = answer
     errors = None if motion is None else motion_errors(motion, pair.target_from_source)
-    told = source is not None and target is not None
-    return _Scored(errors, motion, pair_confusion(source, target, pair) if told else None)
+    if source is None or target is None:
+        return _Scored(errors, motion, None)
+    return _Scored(errors, motion, pair_confusion(source, target, pair))

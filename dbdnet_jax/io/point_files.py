@@ -3,7 +3,6 @@
 Nothing in a file is executed, and no other file is opened for it (materials, textures, links).
 """
 
-import json
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -69,23 +68,6 @@ def read_file(path: Path, seed: int = 0) -> np.ndarray:
             f"a point file must be whole and of the kind its ending says; {path} is not: "
             f"{str(error).rstrip('.') or type(error).__name__}. Export it again."
         ) from error
-
-
-def read_transform(path: Path) -> np.ndarray:
-    """The numbers of a transform's file (.txt, .json with "transform", .npy), unchecked.
-
-    Raises:
-      ValueError: another or a damaged file.
-      OSError: it cannot be opened.
-    """
-    try:
-        if path.suffix.lower() == ".json":
-            return np.array(json.loads(path.read_text())["transform"], np.float64)
-        if path.suffix.lower() == ".npy":
-            return np.load(path, allow_pickle=False)
-        return np.array([line.split() for line in path.read_text().splitlines()], np.float64)
-    except (ValueError, KeyError, TypeError, EOFError) as error:
-        raise ValueError(f"a transform's file must hold 4x4 numbers; {path}: {error}.") from error
 
 
 def check_points(values: Any, name: str = "points") -> Points:

@@ -7,6 +7,7 @@ needs neither: they are folded into the affine map, exactly.
 DBDNet itself has group norms only, see `dbdnet_jax.networks.blocks`.
 """
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -139,4 +140,4 @@ def fold(tree: Mapping[str, Any]) -> dict[str, Any]:
 
 def fold_params(params: Params) -> Params:
     """`fold` for all networks of a method."""
-    return params.replace(networks=fold(params.networks))
+    return dataclasses.replace(params, networks=fold(params.networks))

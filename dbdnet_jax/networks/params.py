@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from dbdnet_jax.io.safe_pickle import CheckpointError
+from dbdnet_jax.errors import CheckpointError
 
 Shapes = dict[str, tuple[int, ...]]  # of every parameter, by its names in the tree joined with /
 _LISTED = 50  # names of each kind in an error: another network's file would fill pages
@@ -67,3 +67,15 @@ def require_shapes(found: Shapes, expected: Shapes, owner: str, fix: str) -> Non
             if entries
         )
         raise CheckpointError(f"{owner} must hold exactly the network's parameters; {lists}. {fix}")
+
+
+def require_finite(arrays: Mapping[str, np.ndarray], owner: str) -> None:
+    """Raise ``CheckpointError`` listing the arrays that have no finite float32 for every number."""
+    with np.errstate(over="ignore"):
+        bad = [name for name, x in arrays.items() if not np.isfinite(np.asarray(x, "f4")).all()]
+    if bad:
+        raise CheckpointError(
+            f"{owner} must hold finite numbers; NaN, infinity or more than float32 holds is in "
+            f"{len(bad)} of {len(arrays)} arrays: {', '.join(bad[:_LISTED])}. Train again, or "
+            "fetch the file again."
+        )

@@ -6,8 +6,15 @@ from typing import Any, NamedTuple
 from dbdnet_jax.networks.dbdnet import method as dbdnet
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.dbdnet.released import from_released
+from dbdnet_jax.networks.dcp import network as dcp
+from dbdnet_jax.networks.dcp.released import from_released as dcp_from_released
+from dbdnet_jax.networks.finet import network as finet
+from dbdnet_jax.networks.inenet import network as inenet
 from dbdnet_jax.networks.masknet import network as masknet
+from dbdnet_jax.networks.omnet import network as omnet
 from dbdnet_jax.networks.params import Params, Shapes
+from dbdnet_jax.networks.rienet import network as rienet
+from dbdnet_jax.networks.rienet.released import from_released as rienet_from_released
 from dbdnet_jax.types import Answer
 
 
@@ -46,6 +53,18 @@ LEARNED = {
     "masknet": Learned(
         "MaskNet", masknet.MaskNetConfig, masknet.shapes, ("masknet",), masknet.predict
     ),
+    "dcp": Learned("DCP", dcp.DCPConfig, dcp.shapes, ("dcp",), dcp.predict, dcp_from_released),
+    "rienet": Learned(
+        "RIENet",
+        rienet.RIENetConfig,
+        rienet.shapes,
+        ("rienet",),
+        rienet.predict,
+        rienet_from_released,
+    ),
+    "omnet": Learned("OMNet", omnet.OMNetConfig, omnet.shapes, ("omnet",), omnet.predict),
+    "finet": Learned("FINet", finet.FINetConfig, finet.shapes, ("finet",), finet.predict),
+    "inenet": Learned("INENet", inenet.INENetConfig, inenet.shapes, ("inenet",), inenet.predict),
 }
 
 

@@ -6,19 +6,30 @@ import dataclasses
 import hashlib
 import io
 import json
+import math
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.io.files import write_atomic
-from dbdnet_jax.io.safe_pickle import CheckpointError
-from dbdnet_jax.networks.params import Params, flatten, require_shapes, unflatten
+from dbdnet_jax.io.forks import require_own_jax
+from dbdnet_jax.networks.params import (
+    Params,
+    flatten,
+    require_finite,
+    require_shapes,
+    unflatten,
+)
 from dbdnet_jax.networks.table import DEFAULT_METHOD, LEARNED, method_of, parameter_shapes
 
 PRETRAINED = Path(__file__).parent / "pretrained"
 _FORMAT = 1
+_WIDEST = 65_536  # features of a layer; the widest known have 1,024
+_MOST_MEMBERS = 20_000  # the largest network that a configuration may ask for has 6,000
 _HEADER, _CHECKSUM = "header", "sha256"
 
 
@@ -35,7 +46,8 @@ def save_params(
       metadata: anything JSON can hold, for people: origin, data, figures.
 
     Raises:
-      CheckpointError: the arrays do not fit the configuration, or are no floating-point numbers.
+      CheckpointError: the arrays do not fit the configuration, or are no finite floating-point
+        numbers: such a file could not be loaded.
       OSError: the folder is missing, not writable, or full.
     """
     arrays = flatten(params)
@@ -65,14 +77,17 @@ def load_params(path: str | Path) -> Params:
 
     Raises:
       CheckpointError: the file is truncated or altered, has a field or version this release does
-        not know, or arrays that do not fit its configuration.
+        not know, a configuration out of bounds, or arrays that do not fit it or are not finite.
       OSError: the file cannot be opened.
+      RuntimeError: the process was forked after JAX was used.
     """
+    require_own_jax("load_params")
     header, arrays = _read(path)
     method = header.get("method", DEFAULT_METHOD)
     config = read_model(method, header["model"], str(path))
     _check(arrays, config, str(path))
-    return unflatten(arrays, config)
+    native = {name: x.astype(x.dtype.newbyteorder("="), copy=False) for name, x in arrays.items()}
+    return unflatten(native, config)
 
 
 def read_model(method: str, fields: Mapping[str, Any], owner: str) -> Any:
@@ -81,7 +96,7 @@ def read_model(method: str, fields: Mapping[str, Any], owner: str) -> Any:
     Raises:
       CheckpointError: a method or a field that this release does not know, or a value it refuses.
     """
-    if method not in LEARNED:
+    if not isinstance(method, str) or method not in LEARNED:
         raise CheckpointError(
             f"{owner}: the method must be one of {', '.join(LEARNED)}; got {method!r}. Update "
             "dbdnet_jax: a newer release wrote the file."
@@ -93,10 +108,17 @@ def read_model(method: str, fields: Mapping[str, Any], owner: str) -> Any:
             f"{owner}: every field of the configuration must be known; {', '.join(unknown)} "
             "is not. Update dbdnet_jax: a newer release wrote the file."
         )
+    for name, value in fields.items():
+        for width in value if isinstance(value, list) else ():
+            if type(width) is not int or not 1 <= width <= _WIDEST:
+                raise CheckpointError(
+                    f"{owner}: the configuration cannot be built: {name} must hold whole numbers "
+                    f"from 1 to {_WIDEST}; got {width!r:.60}. Save it again with save_params."
+                )
     try:
         # JSON has no tuples; a configuration must be hashable.
         return record(**{k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()})
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, ArithmeticError) as error:
         raise CheckpointError(f"{owner}: the configuration cannot be built: {error}") from error
 
 
@@ -145,28 +167,78 @@ def _checksum(header: str, arrays: Mapping[str, np.ndarray]) -> str:
 
 def _read(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays of a file, its checksum verified."""
-    with open(path, "rb") as file:
-        try:
-            with np.load(file, allow_pickle=False) as archive:
-                arrays = {name: archive[name] for name in archive.files}
-            text, checksum = (str(arrays.pop(name)[()]) for name in (_HEADER, _CHECKSUM))
-        except Exception as error:  # NumPy and zipfile answer damage with a dozen types of error
-            raise CheckpointError(
-                f"{path}: the file is truncated, damaged or was not written by save_params "
-                f"({type(error).__name__}: {error}). Fetch it or save it again; a PyTorch "
-                "checkpoint is read by from_released."
-            ) from error
+    try:
+        with open(path, "rb") as file:
+            arrays = _members(file)
+        text, checksum = (str(arrays.pop(name)[()]) for name in (_HEADER, _CHECKSUM))
+    except OSError:
+        raise
+    except Exception as error:  # NumPy and zipfile answer damage with a dozen types of error
+        raise CheckpointError(
+            f"{path}: the file is truncated, damaged or was not written by save_params "
+            f"({type(error).__name__}: {error}). Fetch it or save it again; a PyTorch "
+            "checkpoint is read by from_released."
+        ) from error
     if _checksum(text, arrays) != checksum:
         raise CheckpointError(
             f"{path}: the content must hash to the sha256 it was saved with, {checksum[:12]}...; "
             "it was altered or damaged. Fetch it or save it again."
         )
-    header = json.loads(text)
-    if header["format"] != _FORMAT:
+    return _header(text, str(path)), arrays
+
+
+def _members(file: Any) -> dict[str, np.ndarray]:
+    """The arrays of an archive as `numpy.savez` writes it: stored, none larger than its bytes.
+
+    `numpy.load` would believe what the archive and its arrays say of their sizes, and a file of a
+    few megabytes may unpack to any number of gigabytes.
+    """
+    size = file.seek(0, io.SEEK_END)
+    arrays = {}
+    with zipfile.ZipFile(file) as archive:
+        members = archive.infolist()
+        stored = all(member.compress_type == zipfile.ZIP_STORED for member in members)
+        if not stored or sum(member.file_size for member in members) > size:
+            raise ValueError("its arrays must be stored uncompressed, as save_params does")
+        if len(members) > _MOST_MEMBERS:
+            raise ValueError(f"it must hold at most {_MOST_MEMBERS} arrays; got {len(members)}")
+        for member in members:
+            with archive.open(member) as stream:
+                arrays[member.filename.removesuffix(".npy")] = _array(stream, member.file_size)
+    return arrays
+
+
+def _array(stream: Any, size: int) -> np.ndarray:
+    """One array of numbers or text in NumPy's format, which must fill ``size`` bytes exactly."""
+    version = np.lib.format.read_magic(stream)
+    read_head = {(1, 0): "read_array_header_1_0", (2, 0): "read_array_header_2_0"}[version]
+    shape, fortran, dtype = getattr(np.lib.format, read_head)(stream)
+    data = stream.read(size)
+    if dtype.kind not in "fiubU" or math.prod(shape) * dtype.itemsize != len(data):
+        raise ValueError(f"an array of {dtype} {shape} does not fill {len(data)} bytes")
+    return np.ndarray(shape, dtype, data, order="F" if fortran else "C")
+
+
+def _header(text: str, path: str) -> dict[str, Any]:
+    """The header's fields, their types checked: a checksum says nothing about sense."""
+    try:
+        header = json.loads(text)
+    except (ValueError, RecursionError) as error:
         raise CheckpointError(
-            f"{path}: the format must be {_FORMAT}; got {header['format']!r}. Update dbdnet_jax."
+            f"{path}: the header must be JSON; {error}. Fetch it or save it again."
+        ) from error
+    if not isinstance(header, dict) or header.get("format") != _FORMAT:
+        got = header.get("format") if isinstance(header, dict) else header
+        raise CheckpointError(
+            f"{path}: the format must be {_FORMAT}; got {got!r:.60}. Update dbdnet_jax."
         )
-    return header, arrays
+    for name in ("model", "metadata"):
+        if not isinstance(header.get(name), dict):
+            raise CheckpointError(
+                f"{path}: the header must hold an object named {name!r}; got "
+                f"{header.get(name)!r:.60}. Save it again with save_params."
+            )
+    return header
 
 
 def _check(arrays: Mapping[str, np.ndarray], config: Any, owner: str) -> None:
@@ -178,9 +250,14 @@ def _check(arrays: Mapping[str, np.ndarray], config: Any, owner: str) -> None:
         owner,
         "Do configuration and arrays come from the same training?",
     )
-    wrong = [f"{name} ({array.dtype})" for name, array in arrays.items() if array.dtype.kind != "f"]
+    wrong = [
+        f"{name} ({array.dtype})"
+        for name, array in arrays.items()
+        if array.dtype.kind != "f" or array.dtype.itemsize > 8
+    ]
     if wrong or not arrays:
         raise CheckpointError(
             f"{owner} must hold float16, float32 or float64 parameters; got "
             f"{', '.join(wrong) or 'no array'}. Convert them first."
         )
+    require_finite(arrays, owner)

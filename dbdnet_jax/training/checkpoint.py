@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.io.files import write_atomic
-from dbdnet_jax.io.safe_pickle import CheckpointError
 from dbdnet_jax.networks.batch_norm import join_batch_stats
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.table import DEFAULT_METHOD, LEARNED

@@ -20,6 +20,8 @@ from dbdnet_jax.networks.table import DEFAULT_METHOD, LEARNED
 from dbdnet_jax.training.table import STAGES
 from dbdnet_jax.training.task import RunConfig, TrainConfig
 
+LARGEST = 1e15  # of any number: whole numbers below it are exact as floats, and no count is larger
+
 
 def default_config(method: str = DEFAULT_METHOD) -> ConfigDict:
     """Every field there is for a method, at its default; locked, so that a typo is an error.
@@ -46,7 +48,7 @@ def read_config(config: ConfigDict) -> RunConfig:
     """
     given = config.to_dict()
     method = given.pop("method", DEFAULT_METHOD)
-    if method not in LEARNED:
+    if not isinstance(method, str) or method not in LEARNED:
         raise ValueError(
             f"config.method must be one of {', '.join(LEARNED)}; got {method!r}. Choose one."
         )
@@ -83,28 +85,53 @@ def _require_known(given: Mapping[str, Any], known: Mapping[str, Any], where: st
 
 
 def read_record(record: type, section: Mapping[str, Any], where: str) -> Any:
-    """``record`` from a mapping with exactly its fields; nested records from nested mappings."""
+    """``record`` from a mapping of its fields, the others at their defaults; nested ones alike."""
     types = typing.get_type_hints(record)
     _require_known(section, types, where, f"the fields of {record.__name__}")
-    optional = {
-        field.name
-        for field in dataclasses.fields(record)
-        if field.default is not dataclasses.MISSING
+    values = {
+        name: _read_value(types[name], value, f"{where}.{name}") for name, value in section.items()
     }
-    missing = [name for name in types if name not in section and name not in optional]
-    if missing:
+    try:
+        return record(**values)
+    except ValueError as error:
+        if str(error).startswith("config."):
+            raise
+        raise ValueError(f"in {where}: {error}") from error
+
+
+def _read_value(kind: Any, value: Any, where: str) -> Any:
+    """A field's value: of the field's type, and finite; for a nested record, the record."""
+    if dataclasses.is_dataclass(kind):
+        if not isinstance(value, Mapping):
+            raise ValueError(
+                f"{where} must be a section of fields; got {value!r:.60}. Start from a config in "
+                "configs/."
+            )
+        return read_record(typing.cast(type, kind), value, where)
+    if typing.get_origin(kind) is tuple:
+        if not isinstance(value, tuple | list):
+            raise ValueError(
+                f"{where} must be of type tuple; got {value!r:.60} ({type(value).__name__}). Give "
+                "a value of that type."
+            )
+        inside = typing.get_args(kind)
+        kinds = inside[:1] * len(value) if inside[-1:] == (...,) else inside
+        if len(kinds) != len(value):
+            raise ValueError(
+                f"{where} must be {len(kinds)} values; got {len(value)}. Give so many."
+            )
+        return tuple(map(_read_value, kinds, value, [where] * len(value)))
+    accepted = (int, float) if kind is float else kind
+    if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
         raise ValueError(
-            f"{where} must hold every field of {record.__name__}; it lacks {', '.join(missing)}. "
-            "Start from a config in configs/ and state only the differences."
+            f"{where} must be of type {kind.__name__}; got {value!r:.60} "
+            f"({type(value).__name__}). Give a value of that type."
         )
-    return record(
-        **{
-            name: read_record(types[name], value, f"{where}.{name}")
-            if dataclasses.is_dataclass(types[name])
-            else value
-            for name, value in section.items()
-        }
-    )
+    if isinstance(value, int | float) and not abs(value) < LARGEST:
+        raise ValueError(
+            f"{where} must be finite and below {LARGEST:g}; got {value!r:.60}. Give such a number."
+        )
+    return float(value) if kind is float else value
 
 
 def stage_record(config: RunConfig, stage: str) -> dict[str, Any]:
@@ -151,6 +178,8 @@ def parse_flags(arguments: list[str]) -> list[str]:
             f"error: only fields of the configuration can be set; it has no {field}. "
             f"{' '.join(hint)}".rstrip()
         ) from None
+    except (ValueError, TypeError) as error:  # a value that is of another type than its field
+        raise SystemExit(f"error: {error}") from None
     path = config_flags.get_config_filename(flags.FLAGS["config"])
     if not Path(path).is_file():
         raise SystemExit(

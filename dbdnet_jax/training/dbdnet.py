@@ -97,10 +97,10 @@ def overlap_loss_of(
     start_key, dropout_key = jax.random.split(key)
     # Each pass is trained for itself, from starts such as the passes before it may leave.
     start = initial_pose(start_key, pair) if model.overlap_passes > 1 else None
-    *predicted, matched = predict_overlap_and_matches(
+    source, target, matched = predict_overlap_and_matches(
         params, pair.source, pair.target, dropout_key if model.dropout else None, start
     )
-    return overlap_loss(*predicted, pair, gamma, matched)
+    return overlap_loss(source, target, pair, gamma, matched)
 
 
 def validate_overlap(
@@ -108,9 +108,9 @@ def validate_overlap(
 ) -> dict[str, Float[Array, ""]]:
     """The share of points of the wrong class after all passes, the loss, and F1."""
     params = Params({"overlap": trainable}, model)
-    *predicted, matched = predict_overlap_and_matches(params, pair.source, pair.target)
-    counts = pair_confusion(*predicted, pair)
-    loss = overlap_loss(*predicted, pair, gamma, matched)[0]
+    source, target, matched = predict_overlap_and_matches(params, pair.source, pair.target)
+    counts = pair_confusion(source, target, pair)
+    loss = overlap_loss(source, target, pair, gamma, matched)[0]
     return {"error": overlap_error(counts), "loss": loss, "f1": overlap_f1(counts)}
 
 
@@ -168,8 +168,8 @@ def validate_registration(
 
 def _register_given(model, trainable, pair, masks, dropout_key=None) -> Registration:
     params = Params({"registration": trainable}, model)
-    masks = [mask * 1.0 for mask in masks]
-    return register_given_overlap(params, pair.source, pair.target, *masks, dropout_key)
+    source, target = (mask * 1.0 for mask in masks)
+    return register_given_overlap(params, pair.source, pair.target, source, target, dropout_key)
 
 
 def joint_turn(
@@ -184,12 +184,12 @@ def joint_turn(
     Returns both clouds' overlap, the matches, the registration, and the pair it is of.
     """
     params = Params(networks, model)
-    *overlap, matched = predict_overlap_and_matches(
+    source, target, matched = predict_overlap_and_matches(
         params, pair.source, pair.target, dropout_key, start
     )
     moved = pair if start is None else transform_source(pair, start)
-    found = register_given_overlap(params, moved.source, moved.target, *overlap, dropout_key)
-    return overlap, matched, found, moved
+    found = register_given_overlap(params, moved.source, moved.target, source, target, dropout_key)
+    return (source, target), matched, found, moved
 
 
 def joint_start(
@@ -228,7 +228,8 @@ def joint_loss_of(
     overlap, matched, found, moved = joint_turn(
         model, trainable, pair, start, dropout_key if model.dropout else None
     )
-    first, overlap_terms = overlap_loss(*overlap, pair, gamma, matched)
+    source, target = overlap
+    first, overlap_terms = overlap_loss(source, target, pair, gamma, matched)
     second, registration_terms = registration_loss(found, moved, weights)
     return first + second, JointTerms(*overlap_terms, *registration_terms)
 

@@ -6,7 +6,7 @@ import functools
 from pathlib import Path
 from typing import Any
 
-from dbdnet_jax.io.safe_pickle import CheckpointError
+from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.training.checkpoint import load_best

@@ -83,6 +83,7 @@ def validate(
 ) -> dict[str, Float[Array, ""]]:
     """The share of points of the wrong class, and F1."""
     answer = predict(Params({"masknet": weights}, model), pair.source, pair.target)
+    assert answer.source_overlap is not None and answer.target_overlap is not None  # its whole work
     counts = pair_confusion(answer.source_overlap, answer.target_overlap, pair)
     return {"error": overlap_error(counts), "f1": overlap_f1(counts)}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import jax
@@ -24,7 +25,7 @@ def initial_params(config: RunConfig) -> Params:
     fresh = init_params(jax.random.key(config.train.seed), config.model)
     if not config.train.start:
         return fresh
-    return fresh.replace(networks={**fresh.networks, **load_start(config).networks})
+    return dataclasses.replace(fresh, networks={**fresh.networks, **load_start(config).networks})
 
 
 def load_start(config: RunConfig) -> Params:
@@ -47,4 +48,4 @@ def load_start(config: RunConfig) -> Params:
         f"config.train.start={config.train.start}",
         "Give weights of the same widths as config.model, or set config.train.start=''.",
     )
-    return start.replace(config=config.model)
+    return dataclasses.replace(start, config=config.model)

@@ -11,6 +11,7 @@ from dbdnet_jax.data.config import DataConfig
 from dbdnet_jax.data.pairs import Protocol
 
 OPTIMIZERS = ("adamw", "adam")
+LARGEST_BATCH = 2**16  # pairs of a step, all of which are in memory
 SCHEDULES = ("cosine", "constant", "steps")
 
 
@@ -94,6 +95,23 @@ class TrainConfig:
                 "config.train.decay_epochs must be 0 but for schedule='constant'; got "
                 f"{self.decay_epochs} for {self.schedule!r}. Change one of the two."
             )
+        for name in (
+            "weight_decay",
+            "decay_epochs",
+            "warmup_epochs",
+            "clip_norm",
+            "devices",
+            "seed",
+        ):
+            if getattr(self, name) < 0:
+                raise ValueError(
+                    f"config.train.{name} must not be negative; got {getattr(self, name)}. Use 0."
+                )
+        _check_steps("train", self)
+        if not 0 <= self.ema_decay < 1:
+            raise ValueError(
+                f"config.train.ema_decay must be in [0, 1); got {self.ema_decay}. Use 0 for none."
+            )
         for name in ("log_every", "validate_every", "checkpoint_every", "validation_pairs"):
             value = getattr(self, name)
             if value < 1:
@@ -124,8 +142,18 @@ class RunConfig:
 
 def check_stage(name: str, stage: Any) -> None:
     """Refuse a stage of nothing."""
-    if stage.epochs <= 0 or stage.batch_size < 1:
+    if stage.epochs <= 0:
+        raise ValueError(f"config.{name}.epochs must be positive; got {stage.epochs}. Use 1.")
+    _check_steps(name, stage)
+
+
+def _check_steps(name: str, section: Any) -> None:
+    if not 1 <= section.batch_size <= LARGEST_BATCH:
         raise ValueError(
-            f"config.{name} must have epochs > 0 and batch_size >= 1; got epochs={stage.epochs}, "
-            f"batch_size={stage.batch_size}."
+            f"config.{name}.batch_size must be from 1 to {LARGEST_BATCH}; got "
+            f"{section.batch_size}. Use 8."
+        )
+    if section.learning_rate <= 0:
+        raise ValueError(
+            f"config.{name}.learning_rate must be positive; got {section.learning_rate}. Use 1e-4."
         )

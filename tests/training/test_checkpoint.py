@@ -8,7 +8,7 @@ import numpy as np
 import optax
 import pytest
 
-from dbdnet_jax.io.safe_pickle import CheckpointError
+from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.training.checkpoint import Checkpoints, load_best, write_stage
 from dbdnet_jax.training.step import init_state

@@ -10,7 +10,7 @@ import pytest
 
 from configs import cad
 from dbdnet_jax.data.training_pairs import PairStream, pairs_of_shapes
-from dbdnet_jax.io.safe_pickle import CheckpointError
+from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import save_params
 from dbdnet_jax.training.checkpoint import Checkpoints, load_best, write_stage

@@ -11,6 +11,8 @@ from dbdnet_jax.ops.rigid import HIGHEST
 from dbdnet_jax.ops.sampling import farthest_order, inverse_order, prefix_order
 from dbdnet_jax.types import Cloud, Rigid
 
+FEWEST_ROWS = 8  # of a stack: the coarsest of four levels has one row
+
 
 def pad_rows(x: jax.Array, size: int) -> jax.Array:
     """Pad the rows of ``x`` with zeros to ``size``."""
@@ -19,7 +21,7 @@ def pad_rows(x: jax.Array, size: int) -> jax.Array:
 
 def stack_clouds(source: Cloud, target: Cloud) -> Cloud:
     """Two clouds of any static sizes as one stack; padding, as everywhere, changes nothing."""
-    size = max(source.points.shape[0], target.points.shape[0])
+    size = max(source.points.shape[0], target.points.shape[0], FEWEST_ROWS)
     points = jnp.stack([pad_rows(source.points, size), pad_rows(target.points, size)])
     points = points.astype(jnp.promote_types(points.dtype, jnp.float32))
     return Cloud(points, jnp.stack([jnp.asarray(source.count), jnp.asarray(target.count)]))
@@ -27,7 +29,7 @@ def stack_clouds(source: Cloud, target: Cloud) -> Cloud:
 
 def stack_masked(src, tgt, src_mask, tgt_mask) -> tuple[Cloud, Int[Array, "2 n"]]:
     """Stack two clouds with masks; ``order[c, row]`` is the caller's row of a stacked row."""
-    size = max(src.shape[0], tgt.shape[0])
+    size = max(src.shape[0], tgt.shape[0], FEWEST_ROWS)
     masks = [
         pad_rows(jnp.ones(x.shape[0], bool) if mask is None else mask, size)
         for x, mask in ((src, src_mask), (tgt, tgt_mask))

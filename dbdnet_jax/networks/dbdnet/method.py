@@ -43,5 +43,7 @@ def predict_given_overlap(
     """The registration network alone, told which points overlap; solves as often as `register`."""
     config = dataclasses.replace(params.config, iterations=params.config.solves)
     labels = (label.astype(jnp.float32) for label in (source_overlap, target_overlap))
-    found = register_given_overlap(params.replace(config=config), source, target, *labels)
+    found = register_given_overlap(
+        dataclasses.replace(params, config=config), source, target, *labels
+    )
     return Answer(found.motion)

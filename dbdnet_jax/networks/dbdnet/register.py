@@ -47,12 +47,21 @@ def register(
     far. Coordinates are expected at the scale the weights were trained at (the unit sphere for the
     CAD and ModelNet40 weights). Where nothing can be estimated ``valid`` is False and the motion
     the identity.
+
+    Raises:
+      ValueError: clouds of no or one row, or parameters of the overlap network alone.
     """
     if params.registration is None:
         raise ValueError(
             "register needs a registration network; these params hold only the overlap network. "
             "Use predict_overlap, or load a full checkpoint."
         )
+    for name, cloud in (("src", src), ("tgt", tgt)):
+        if cloud.shape[0] < 2:
+            raise ValueError(
+                f"{name} must be (n, 3) with n >= 2 (3 to be registered); got "
+                f"{cloud.shape}. Give more points."
+            )
     clouds, order = stack_masked(src, tgt, src_mask, tgt_mask)
     sizes = src.shape[0], tgt.shape[0]
     prepared = prepare_pair(params.config, clouds)

@@ -7,6 +7,7 @@ the usual threshold of 0.5 applies.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -107,7 +108,7 @@ def predict(params: Params, source: Cloud, target: Cloud) -> Answer:
     network, variables = MaskNet(params.config), {"params": fold(params.networks["masknet"])}
 
     def mask(seen: Cloud, template: Cloud) -> Array:
-        logits = network.apply(variables, seen.points, template.points, seen.valid)
+        logits: Any = network.apply(variables, seen.points, template.points, seen.valid)
         return jnp.where(template.valid, jax.nn.sigmoid(logits), 0.0)
 
     return Answer(None, mask(target, source), mask(source, target))
