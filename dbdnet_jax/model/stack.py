@@ -46,7 +46,9 @@ def geometry_of(clouds: Cloud, config: ModelConfig) -> Float[Array, "2 n g"] | N
     """
     if not config.local_geometry:
         return None
-    return jax.lax.map(lambda one: local_geometry(*one, config.local_geometry), clouds)
+    return jax.lax.map(
+        lambda one: local_geometry(one.points, one.count, config.local_geometry), clouds
+    )
 
 
 def reordered(

@@ -69,8 +69,8 @@ def local_invariants(
     centre = jnp.sum(jnp.where(valid, points, 0.0), axis=0) / total
     points = jnp.where(valid, points - centre[None, :], 0.0)
     x, y, z = points.T
-    powers = [jnp.ones_like(x), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z]
-    powers = jnp.where(valid.T, jnp.stack(powers), 0.0)
+    powers = jnp.stack([jnp.ones_like(x), x, y, z, x * x, x * y, x * z, y * y, y * z, z * z])
+    powers = jnp.where(valid.T, powers, 0.0)
     widest = DEVIATION * RADII[radii - 1]
     bell = jnp.exp(squared_distances(points, points) / (-2.0 * widest * widest))
     found = []
