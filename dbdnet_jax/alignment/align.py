@@ -120,11 +120,10 @@ def align(
       source: (n, 3) numbers, n >= 16, or a file; see `point_files.read_point_file`.
       target: the same, (m, 3), in the same unit.
       params: the network; the weights in the package, if None.
-      refine: refine poses. Without, the network's pose (or a better one of those given) is the
-        answer, and nothing else is searched.
-      search: "near" for poses near the given orientation (or near ``initial``), "any" for all
-        rotations, "auto" for the latter only where the former leaves a doubt. Of poses that fit
-        alike the one nearest to the given orientation is the answer.
+      refine: refine poses; else the best of the network's and those given is the answer.
+      search: "near" for poses near the given orientation (or ``initial``), "any" for all rotations,
+        "auto" for these only where the former leave a doubt. Of poses that fit alike the one
+        nearest to the given orientation is the answer.
       scale: factor from the clouds' unit to the weights'; "auto" brings the larger cloud to the
         size of a partial scan of a shape in the unit sphere.
       overlap_threshold: probability above which a point enters the registration.
@@ -140,11 +139,10 @@ def align(
       RuntimeError: the process was forked after JAX was used, and would hang; spawn it.
     """
     require_own_jax("align")
-    laps = {"start": _clock()}
-    loaded = loading_seconds()
     _check_arguments(search, scale, overlap_threshold, max_points)
     guess = np.eye(4) if initial is None else _check_transform(initial)
     proposed = [_check_transform(x, f"proposals[{i}]") for i, x in enumerate(proposals)]
+    laps, loaded = {"start": _clock()}, loading_seconds()
     source = read_point_file(source, "source", seed=seed)
     target = read_point_file(target, "target", seed=seed + 1)
     laps["read"] = _clock()
@@ -153,19 +151,14 @@ def align(
     laps["weights"] = _clock()
     scene = normalise_pair(source.points, target.points, scale, max_points, guess)
     laps["downsample"] = _clock()
+    given = None if initial is None else as_normalised(guess, scene)
+    others = [as_normalised(transform, scene) for transform in proposed]
     found = finding.find_pose(
-        params,
-        scene,
-        coefficients,
-        search,
-        refine=refine,
-        guess=None if initial is None else as_normalised(guess, scene),
-        proposals=[as_normalised(transform, scene) for transform in proposed],
+        params, scene, coefficients, search, refine=refine, guess=given, proposals=others
     )
     laps["search"] = _clock()
     reason = rejection_reason(scene, found)
-    if not reason and refine:
-        reason = finding.mirror_reason(scene, found, coefficients)
+    reason = reason or (finding.mirror_reason(scene, found, coefficients) if refine else "")
     laps["quality"] = _clock()
     return _report(scene, found, reason, (*source.notes, *target.notes), laps, loaded)
 

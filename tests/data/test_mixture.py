@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from dbdnet_jax.alignment import thinning
+from dbdnet_jax.alignment import downsampling
 from dbdnet_jax.data import scans
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.mixture import (
@@ -56,7 +56,7 @@ def valid_points(pair):
 
 def test_parts_are_the_mixtures():
     assert set(PARTS) == set(Mixture.__dataclass_fields__)
-    assert UNIT_SIZE == thinning.UNIT_SIZE
+    assert UNIT_SIZE == downsampling.UNIT_SIZE
 
 
 @pytest.mark.parametrize("name", PARTS)

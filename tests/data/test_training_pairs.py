@@ -118,7 +118,7 @@ def test_a_share_of_the_pairs_is_of_the_mixture():
     key = jax.random.key(0)
 
     def translations(mixture):
-        pairs = shape_source(shapes, shapes, clean, seed=0, validation_pairs=1, mixture=mixture)
+        pairs = pairs_of_shapes(shapes, shapes, clean, seed=0, validation_pairs=1, mixture=mixture)
         arrays = jax.tree.map(jnp.asarray, next(pairs.arrays(0)))
         draw = jax.jit(lambda n: pairs.draw(jax.random.fold_in(key, n), n, arrays).target.points)
         return np.array([np.linalg.norm(draw(jnp.asarray(n)).mean(axis=0)) for n in range(40)])
