@@ -27,7 +27,8 @@ examples:
   dbdnet-register --batch pairs.txt -o transforms/ --report pages/
 
 A file is a cloud (.ply .pcd .xyz .asc .pts .ptx .txt .csv .npy .npz .bin, and .las .laz .e57 with
-the extra "formats") or a mesh (.ply .obj .off .stl .glb), of any size; both in the same unit. The transform T is 4x4: B ~ T A.
+the extra "formats") or a mesh (.ply .obj .off .stl .glb), of any size; both in
+the same unit. The transform T is 4x4: B ~ T A.
 
 A batch is a text file with two paths a line (from its own folder; # comments), or a folder whose
 files are named NAME_source.* and NAME_target.*; transforms go to FOLDER/NAME.txt, reports to
