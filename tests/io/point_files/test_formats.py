@@ -91,7 +91,7 @@ def pcd(fields: str, size: str, kind: str, body: bytes, data: str = "ascii", n: 
     return head.encode() + body
 
 
-ROWS = "".join("%.3f %.3f %.3f\n" % tuple(p) for p in POINTS)
+ROWS = "".join("{:.3f} {:.3f} {:.3f}\n".format(*tuple(p)) for p in POINTS)
 
 
 @pytest.mark.parametrize(
