@@ -1,8 +1,8 @@
-"""Score DBDNet beside ICP and FGR on frozen test pairs, and print the paper's table.
+"""Score learned methods beside ICP and FGR on frozen test pairs, and print the paper's table.
 
     python evaluate.py --config=configs/cad.py                     # what train.py left in runs/cad
     python evaluate.py --config=configs/cad.py --params=cad        # the weights in the package
-    python evaluate.py --config=configs/cad.py --params=mine.npz
+    python evaluate.py --config=configs/cad.py --params=mine.npz --params=cad  # a row for each
     python evaluate.py --config=configs/cad.py --params=cad --sweep=crop
 
 The configuration's data set and protocol decide the pairs: --config.protocol.noise_sigma=0.0
@@ -21,19 +21,22 @@ from ml_collections import config_flags
 from dbdnet_jax.data.test_pairs import load_test_pairs
 from dbdnet_jax.drawing.evaluation_page import evaluation_page
 from dbdnet_jax.errors import MissingExtraError, require_drawing
+from dbdnet_jax.evaluation.methods import Weights
 from dbdnet_jax.evaluation.run import evaluate
 from dbdnet_jax.evaluation.sweep import SWEEP_PAIRS, SWEEPS, render_sweep, save_sweep, sweep
 from dbdnet_jax.evaluation.tables import render, save
-from dbdnet_jax.io.files import write_atomic
-from dbdnet_jax.io.programs import keep_compiled_programs
-from dbdnet_jax.networks.params import Params
+from dbdnet_jax.io.files import require_writable, write_atomic
+from dbdnet_jax.io.programs import keep_compiled_programs, require_device
 from dbdnet_jax.networks.weights import PRETRAINED, load_named
-from dbdnet_jax.training.checkpoint import JOINT, STAGES, load_best
-from dbdnet_jax.training.config import RunConfig, parse_flags, read_config
+from dbdnet_jax.training.checkpoint import load_best, was_trained
+from dbdnet_jax.training.config import parse_flags, read_config
+from dbdnet_jax.training.task import RunConfig
 
 CONFIG = config_flags.DEFINE_config_file("config", None, "Configuration file, configs/NAME.py.")
 RUN_DIR = flags.DEFINE_string("run_dir", None, "The run to score; runs/NAME if not given.")
-PARAMS = flags.DEFINE_string("params", None, "Weights: a .npz file or a name; else the run's best.")
+PARAMS = flags.DEFINE_multi_string(
+    "params", None, "Weights: a .npz file or a name; else the run's best. May be given repeatedly."
+)
 BENCHMARK = flags.DEFINE_enum("benchmark", "3DMatch", ["3DMatch", "3DLoMatch"], "For scans.")
 COUNT = flags.DEFINE_integer("count", None, "Only the first pairs.", lower_bound=1)
 SWEEP = flags.DEFINE_multi_enum(
@@ -42,23 +45,25 @@ SWEEP = flags.DEFINE_multi_enum(
 REPORT = flags.DEFINE_bool("report", False, "Draw a page too, with the sweeps saved in RUN_DIR.")
 
 
-def choose_params(params: str | None, run_dir: str | None, config_name: str) -> Params:
-    """The weights asked for: a file, or a name of weights in the package, or a run's best.
+def choose_weights(
+    params: list[str] | None, run_dir: str | None, config_name: str
+) -> list[Weights]:
+    """The weights asked for: files, or names of weights in the package, or a run's best.
 
     Without any of them the best of runs/NAME or, where nothing was trained, the package's for the
     configuration of that name.
     """
-    if params is not None:
-        return load_named(params)
+    if params:
+        return [Weights(Path(name).stem, load_named(name)) for name in params]
     default = Path("runs") / config_name
-    trained = any((default / stage / "checkpoints").is_dir() for stage in (*STAGES, JOINT))
-    if run_dir is not None or trained or not (PRETRAINED / f"{config_name}.npz").is_file():
-        return load_best(run_dir or default)
+    packaged = (PRETRAINED / f"{config_name}.npz").is_file()
+    if run_dir is not None or was_trained(default) or not packaged:
+        return [Weights("best", load_best(run_dir or default))]
     print(f"{default} holds no training; scoring the weights in the package.", file=sys.stderr)
-    return load_named(config_name)
+    return [Weights(config_name, load_named(config_name))]
 
 
-def run_sweeps(config: RunConfig, params: Params, run_dir: Path) -> None:
+def run_sweeps(config: RunConfig, weights: list[Weights], run_dir: Path) -> None:
     """Print and write one table for each sweep asked for."""
     for name in SWEEP.value or ():
         points = list(
@@ -66,7 +71,7 @@ def run_sweeps(config: RunConfig, params: Params, run_dir: Path) -> None:
                 name,
                 config.data,
                 config.protocol,
-                params,
+                weights,
                 run_dir,
                 seed=config.train.seed,
                 count=COUNT.value or SWEEP_PAIRS,
@@ -91,26 +96,28 @@ def main(argv: list[str]) -> None:
     config_name = Path(config_flags.get_config_filename(flags.FLAGS["config"])).stem
     run_dir = Path(RUN_DIR.value or Path("runs") / config_name)
     try:
+        require_writable(run_dir)
+        require_device()
         if REPORT.value:
             require_drawing()
         config = read_config(CONFIG.value)
-        params = choose_params(PARAMS.value, RUN_DIR.value, config_name)
+        weights = choose_weights(PARAMS.value, RUN_DIR.value, config_name)
         if SWEEP.value:
-            return run_sweeps(config, params, run_dir)
+            return run_sweeps(config, weights, run_dir)
         evaluation = evaluate(
-            params,
+            weights,
             load_test_pairs(config.data, config.protocol, run_dir, BENCHMARK.value),
             seed=config.train.seed,
             command=shlex.join(["python", *sys.argv]),
             count=COUNT.value,
         )
+        print(render(evaluation))
+        save(evaluation, run_dir)
+        if REPORT.value:
+            page = run_dir / f"evaluation_{evaluation.pair_set}.html"
+            write_atomic(page, evaluation_page(evaluation, run_dir))
     except (ValueError, OSError, MissingExtraError) as error:
         sys.exit(f"error: {error}")
-    print(render(evaluation))
-    save(evaluation, run_dir)
-    if REPORT.value:
-        page = run_dir / f"evaluation_{evaluation.pair_set}.html"
-        write_atomic(page, evaluation_page(evaluation, run_dir))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Train DBDNet: the overlap network, then the registration network behind it; then perhaps both.
+"""Train a learned method: for DBDNet the overlap network, then the registration network behind it.
 
     python train.py --config=configs/cad_short.py
     python train.py --config=configs/cad.py --config.train.batch_size=4 --run_dir=runs/mine
@@ -19,20 +19,36 @@ from ml_collections import config_flags
 
 from dbdnet_jax.data.test_pairs import load_test_pairs
 from dbdnet_jax.data.training_pairs import load_training_pairs
+from dbdnet_jax.evaluation.methods import Weights
 from dbdnet_jax.evaluation.run import evaluate
 from dbdnet_jax.evaluation.tables import render, save
-from dbdnet_jax.io.programs import keep_compiled_programs
+from dbdnet_jax.io.programs import keep_compiled_programs, require_device
+from dbdnet_jax.networks.table import LEARNED
 from dbdnet_jax.networks.weights import save_params
-from dbdnet_jax.training.checkpoint import JOINT, STAGES, load_best
+from dbdnet_jax.training.checkpoint import JOINT, load_best
 from dbdnet_jax.training.config import parse_flags, read_config
 from dbdnet_jax.training.loop import fit
+from dbdnet_jax.training.table import STAGES
 
 CONFIG = config_flags.DEFINE_config_file("config", None, "Configuration file, configs/NAME.py.")
 RUN_DIR = flags.DEFINE_string("run_dir", None, "Where results go; runs/NAME if not given.")
-STAGE = flags.DEFINE_enum(
-    "stage", "both", [*STAGES, "both", JOINT], "What to train; joint goes on from both."
+STAGE = flags.DEFINE_string(
+    "stage", "all", "What to train: a stage of the method, or all (or both) but joint."
 )
 EVALUATE = flags.DEFINE_bool("evaluate", True, "Print the table of results at the end.")
+
+
+def stages_of(method: str, stage: str) -> tuple[str, ...]:
+    """The stages of a method that ``--stage`` asks for."""
+    known = STAGES[method]
+    if stage in ("all", "both"):
+        return tuple(name for name in known if name != JOINT)
+    if stage not in known:
+        raise ValueError(
+            f"--stage must be all, both or one of {', '.join(known)} for the method {method}; got "
+            f"{stage!r}. Choose one."
+        )
+    return (stage,)
 
 
 def main(argv: list[str]) -> None:
@@ -42,30 +58,31 @@ def main(argv: list[str]) -> None:
     logging.set_verbosity(logging.WARNING)  # Orbax tells a page about every checkpoint
     config_file = config_flags.get_config_filename(flags.FLAGS["config"])
     run_dir = Path(RUN_DIR.value or Path("runs") / Path(config_file).stem)
-    stages = STAGES if STAGE.value == "both" else (STAGE.value,)
     try:
         config = read_config(CONFIG.value)
+        stages = stages_of(config.method, STAGE.value)
         # Before anything asks JAX for a device: the number is fixed from then on. More devices
         # than pairs in a step would have nothing to do.
-        pairs = max(getattr(config, stage).batch_size for stage in (*STAGES, JOINT))
+        pairs = max(stage.batch_size for stage in config.stages.values())
         devices = config.train.devices or min(os.cpu_count() or 1, pairs)
         jax.config.update("jax_num_cpu_devices", devices)
         keep_compiled_programs()
+        require_device()
         for stage in stages:
             stream = load_training_pairs(
                 config.data,
                 config.protocol,
                 seed=config.train.seed,
                 validation_pairs=config.train.validation_pairs,
-                batch_size=getattr(config, stage).batch_size,
+                batch_size=config.stages[stage].batch_size,
             )
             fit(config, stage, run_dir, stream)
         params = load_best(run_dir)
         save_params(run_dir / "params.npz", params)
         print(f"The best weights are in {run_dir / 'params.npz'}.")
-        if EVALUATE.value and None not in (params.overlap, params.registration):
+        if EVALUATE.value and set(LEARNED[config.method].parts) <= params.networks.keys():
             evaluation = evaluate(
-                params,
+                [Weights("params", params)],
                 load_test_pairs(config.data, config.protocol, run_dir),
                 seed=config.train.seed,
                 command=shlex.join(["python", *sys.argv]),

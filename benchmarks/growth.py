@@ -24,7 +24,7 @@ from benchmarks.machine import compile_timed, measure, peak_gib, publish, record
 from benchmarks.ops import CONFIG, OUT, RUNS, operations
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.dbdnet.register import register
-from dbdnet_jax.networks.params import init_params
+from dbdnet_jax.networks.initial import init_params
 from dbdnet_jax.training.config import parse_flags, read_config
 
 PARTS = flags.DEFINE_list("parts", ["256", "512", "1024", "2048", "4096"], "Sizes of the parts.")

@@ -25,7 +25,7 @@ from dbdnet_jax.classical.refine import refine
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.dbdnet.encoder import GROUPS
 from dbdnet_jax.networks.edgeconv import EdgeConv
-from dbdnet_jax.networks.params import init_params
+from dbdnet_jax.networks.initial import init_params
 from dbdnet_jax.ops import rigid
 from dbdnet_jax.ops.attention import attention
 from dbdnet_jax.ops.grouping import interpolate, interpolation_weights, knn

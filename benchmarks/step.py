@@ -35,12 +35,14 @@ from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.training_pairs import PairStream, pairs_of_shapes
 from dbdnet_jax.networks.dbdnet.register import register
 from dbdnet_jax.networks.dbdnet.released import from_released
-from dbdnet_jax.networks.params import Params, init_params
-from dbdnet_jax.training.config import RunConfig, parse_flags, read_config
-from dbdnet_jax.training.dbdnet import make_task
-from dbdnet_jax.training.loop import init_state, train_step
+from dbdnet_jax.networks.initial import init_params
+from dbdnet_jax.networks.params import Params
+from dbdnet_jax.training.config import parse_flags, read_config
 from dbdnet_jax.training.optimizer import make_optimizer
 from dbdnet_jax.training.parallel import on_all_devices
+from dbdnet_jax.training.step import init_state, train_step
+from dbdnet_jax.training.table import STAGES
+from dbdnet_jax.training.task import RunConfig
 from dbdnet_jax.types import Pair
 
 CONFIG = config_flags.DEFINE_config_file("config", None, "Configuration file, configs/NAME.py.")
@@ -62,8 +64,8 @@ def training_step(
     config: RunConfig, stream: PairStream, stage: str, rate: float
 ) -> dict[str, float]:
     """One stage's step on fresh parameters; registration learns from the true overlap."""
-    task = make_task(config, stage, "")
-    part, train = getattr(config, stage), config.train
+    task = STAGES[config.method][stage].make_task(config, "")
+    part, train = config.stages[stage], config.train
     optimizer = make_optimizer(
         lambda _: part.learning_rate, weight_decay=train.weight_decay, clip_norm=train.clip_norm
     )

@@ -4,4 +4,5 @@ import sys
 
 from dbdnet_jax.cli import main
 
-sys.exit(main())
+if __name__ == "__main__":  # not where a spawned process imports it
+    sys.exit(main())

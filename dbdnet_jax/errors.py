@@ -1,7 +1,11 @@
-"""Libraries that only an extra of the package brings, and what to say where they are missing."""
+"""Files that cannot be read, and libraries that only an extra of the package brings."""
 
 import importlib.util
 from types import ModuleType
+
+
+class CheckpointError(ValueError):
+    """A file that cannot be read: refused, damaged, or not what its reader expects."""
 
 
 class MissingExtraError(ImportError):
@@ -31,9 +35,9 @@ def require_drawing() -> None:
     Raises:
         MissingExtraError: one is missing.
     """
-    missing = [x for x in ("plotly", "matplotlib") if importlib.util.find_spec(x) is None]
+    missing = [x for x in ("plotly", "matplotlib", "jinja2") if importlib.util.find_spec(x) is None]
     if missing:
         raise MissingExtraError(
-            f"reports and pictures need {' and '.join(missing)}; not installed. "
+            f"reports and pictures need {', '.join(missing)}; not installed. "
             'Run `pip install "dbdnet_jax[report]"`.'
         )

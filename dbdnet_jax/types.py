@@ -6,6 +6,7 @@ Points are rows, features last. A cloud of static size n holds its valid points 
 
 from typing import NamedTuple
 
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 
@@ -15,12 +16,31 @@ class Cloud(NamedTuple):
     points: Float[Array, "n 3"]
     count: Int[Array, ""]  # type: ignore[assignment]  # not tuple.count
 
+    @property
+    def valid(self) -> Bool[Array, "*stack n"]:
+        """Which rows are points; of stacked clouds, of each."""
+        count = jnp.asarray(self.count)
+        rows = jnp.arange(self.points.shape[-2]).reshape((1,) * count.ndim + (-1,))
+        return rows < count[..., None]
+
 
 class Rigid(NamedTuple):
     """A rigid motion ``x -> rotation @ x + translation``, named ``target_from_source``."""
 
     rotation: Float[Array, "3 3"]
     translation: Float[Array, "3"]
+
+
+class Answer(NamedTuple):
+    """What any method says of a pair; None for what it does not say.
+
+    ``motion`` is ``target_from_source``; the overlaps are probabilities of the rows of both clouds,
+    both or none, zero in the padding.
+    """
+
+    motion: Rigid | None = None
+    source_overlap: Float[Array, " n"] | None = None
+    target_overlap: Float[Array, " m"] | None = None
 
 
 class Pair(NamedTuple):
@@ -72,3 +92,8 @@ class Registration(NamedTuple):
     translation_branch: Branch
     confidence: Float[Array, " n"]
     valid: Bool[Array, ""]
+
+    @property
+    def motion(self) -> Rigid:
+        """The rotation and the translation."""
+        return Rigid(self.rotation, self.translation)

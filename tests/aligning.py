@@ -7,7 +7,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from dbdnet_jax.alignment.align import align
-from dbdnet_jax.networks.params import Params, init_params
+from dbdnet_jax.networks.initial import init_params
+from dbdnet_jax.networks.params import Params
 from tests.networks.dbdnet.small import SMALL
 
 POINTS = 150  # one bucket, hence one compiled program, for every test

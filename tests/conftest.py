@@ -9,11 +9,15 @@ import atexit
 import os
 import shutil
 import tempfile
+from pathlib import Path
 from typing import NamedTuple
 
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-# Nearly all of the tests' time is compilation; unoptimised code compiles twice as fast.
-os.environ["XLA_FLAGS"] = f"--xla_backend_optimization_level=0 {os.environ.get('XLA_FLAGS', '')}"
+# Nearly all of the tests' time is compilation; unoptimised code compiles twice as fast. Users run
+# optimised code, and so does a weekly job.
+if not os.environ.get("DBDNET_JAX_TESTS_OPTIMISED"):
+    flags = os.environ.get("XLA_FLAGS", "")
+    os.environ["XLA_FLAGS"] = f"--xla_backend_optimization_level=0 {flags}"
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     _cache = tempfile.mkdtemp(prefix="dbdnet_jax_tests_")
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache
@@ -30,6 +34,24 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_num_cpu_devices", 2)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 install_import_hook("dbdnet_jax", "beartype.beartype")
+
+
+# Folders and files whose tests are marked fast: together under two minutes on two idle cores.
+FAST = """
+io metrics ops/test_normals.py ops/test_rigid.py ops/test_sinkhorn.py
+networks/test_params.py networks/test_weights.py networks/dbdnet/test_released.py
+data/test_surface.py data/test_modelnet40.py
+test_configs.py test_structure.py test_guards.py
+""".split()
+
+
+def pytest_collection_modifyitems(items):
+    """Mark the tests of `FAST`."""
+    here = Path(__file__).parent
+    for item in items:
+        path = item.path.relative_to(here)
+        if {str(path), path.parts[0]} & set(FAST):
+            item.add_marker("fast")
 
 
 @pytest.fixture(scope="module", autouse=True)

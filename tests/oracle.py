@@ -119,6 +119,30 @@ def interpolate(features, dense, sparse, count):
     return out
 
 
+def local_invariants(points, radii, deviation=0.6):
+    """Eight numbers about each point for each radius, from the eigenvectors of each covariance."""
+    rows = []
+    for point in np.float64(points):
+        row = []
+        for r in radii:
+            weights = [
+                math.exp(-squared_distance(point, q) / (2 * (deviation * r) ** 2)) for q in points
+            ]
+            mass = sum(weights)
+            mean = sum(w * np.float64(q) for w, q in zip(weights, points, strict=True)) / mass
+            m = np.zeros((3, 3))
+            for w, q in zip(weights, points, strict=True):
+                m += w * np.outer(q - mean, q - mean) / mass / r**2
+            o = (mean - point) / r
+            a, b, c = np.maximum(np.linalg.eigvalsh(m), 0.0)
+            turn = np.linalg.det(np.array([o, m @ o, m @ m @ o]))
+            row += [a + b + c, math.sqrt(a * b + b * c + c * a), np.cbrt(a * b * c)]
+            row += [np.linalg.norm(o), math.log(mass / len(points))]
+            row += [math.sqrt(max(o @ m @ o, 0.0)), math.sqrt(np.linalg.norm(m @ o)), np.cbrt(turn)]
+        rows.append(row)
+    return np.array(rows)
+
+
 def attention(query, key, value, valid, heads):
     """softmax(q k / sqrt(width)) v per head over the valid keys; zeros where none is valid."""
     n, d = query.shape

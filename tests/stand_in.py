@@ -15,9 +15,8 @@ import numpy as np
 from dbdnet_jax.data.pairs import Protocol
 from dbdnet_jax.data.shapes import Shapes
 from dbdnet_jax.data.training_pairs import PairStream, pairs_of_shapes
-from dbdnet_jax.training.config import TrainConfig
-from dbdnet_jax.training.dbdnet import Task
 from dbdnet_jax.training.loop import run_task
+from dbdnet_jax.training.task import Task, TrainConfig
 
 PROTOCOL = Protocol(points=24, keep=0.5)
 EPOCHS, BATCH, RATE = 6.0, 4, 0.1  # 12 steps

@@ -12,7 +12,7 @@ import pytest
 from benchmarks import arithmetic, machine
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.dbdnet.register import register
-from dbdnet_jax.networks.params import init_params
+from dbdnet_jax.networks.initial import init_params
 from tests.networks.dbdnet.small import SMALL
 
 N = 64

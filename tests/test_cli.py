@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import warnings
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -13,8 +14,9 @@ import pytest
 
 from dbdnet_jax import save_params
 from dbdnet_jax.alignment.writing import write_ply
-from dbdnet_jax.cli import ALIGNED, UNSURE, UNUSABLE, main
-from dbdnet_jax.io.point_files import read_points, read_transform
+from dbdnet_jax.cli import ALIGNED, FAILED, UNREAD, UNSURE, UNUSABLE, main
+from dbdnet_jax.io.point_files import read_points
+from dbdnet_jax.io.transform_files import read_transform
 from tests.aligning import POINTS, pair, rotation_error_deg, tiny_align, tiny_params
 
 ALIGN = importlib.import_module("dbdnet_jax.alignment.align")  # not the function
@@ -49,7 +51,7 @@ def run(folder, capsys, monkeypatch):
 
 def likely(monkeypatch, probability: float) -> None:
     """Let the success probability be what a test needs; the tiny network is untrained."""
-    monkeypatch.setattr(ALIGN, "success_probability", lambda *_: probability)
+    monkeypatch.setattr("dbdnet_jax.alignment.finding.success_probability", lambda *_: probability)
 
 
 def test_the_summary_goes_to_stdout_and_progress_to_stderr(run, monkeypatch):
@@ -95,12 +97,14 @@ def test_the_moved_source_is_saved(run, tmp_path):
 
 
 def test_no_refinement_is_asked_for(run, monkeypatch):
-    monkeypatch.setattr(
-        "dbdnet_jax.alignment.search.strongest_alternative", lambda *_: pytest.fail("judged")
-    )
+    def settle(*_, last, **__):
+        assert last is False
+        pytest.fail("judged")
+
+    monkeypatch.setattr("dbdnet_jax.alignment.finding.settle", settle)
     refined = []
     monkeypatch.setattr(
-        "dbdnet_jax.alignment.search.refine", lambda pose, *_: refined.append(1) or pose
+        "dbdnet_jax.alignment.finding.examine", lambda *_: refined.append(1) or pytest.fail()
     )
     with pytest.raises(pytest.fail.Exception, match="judged"):
         run("a.ply", "b.ply", "--no-refine")
@@ -113,7 +117,8 @@ def test_a_list_of_pairs_writes_a_transform_each_and_goes_on_after_a_bad_one(run
     )
     status, out, err = run("--batch", tmp_path / "pairs.txt", "-o", tmp_path, "--json", batch=True)
     assert status == UNUSABLE
-    assert "error: a point file must exist" in err and out.count("\n") == 1
+    assert f"error: {tmp_path}/pairs.txt:4: a point file must exist" in err
+    assert out.count("\n") == 1
     assert {path.name for path in tmp_path.iterdir()} == {"pairs.txt", "0002_a_b.txt"}
 
 
@@ -125,6 +130,63 @@ def test_a_folder_of_pairs_goes_by_names(run, folder, tmp_path):
     status, out, _ = run("--batch", tmp_path, "-o", tmp_path / "out", batch=True)
     assert status in (ALIGNED, UNSURE)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["one.txt", "two.txt"]
+
+
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (MemoryError("Unable to allocate 9 GiB"), "out of memory: Unable to allocate 9 GiB"),
+        (RuntimeError("RESOURCE_EXHAUSTED: no room\nmore"), "out of memory: RESOURCE_EXHAUSTED"),
+        (TypeError("a bug\x1b[2J"), r"unexpected TypeError: a bug\x1b[2J. DBDNET_DEBUG=1 shows"),
+        (RecursionError("too deep"), "unexpected RecursionError: too deep"),
+    ],
+)
+def test_an_unexpected_error_costs_its_pair_alone(run, tmp_path, monkeypatch, error, message):
+    align, calls = ALIGN.align, []
+
+    def fail_once(*args, **options):
+        calls.append(1)
+        if len(calls) == 1:
+            raise error
+        return align(*args, **options)
+
+    monkeypatch.setattr(ALIGN, "align", fail_once)
+    (tmp_path / "pairs.txt").write_text(f"{Path.cwd()}/a.ply {Path.cwd()}/b.ply\n" * 2)
+    status, out, err = run("--batch", tmp_path / "pairs.txt", "-o", tmp_path, batch=True)
+    assert status == FAILED and message in err and "Traceback" not in err
+    assert out.count("T =") == 1 and (tmp_path / "0002_a_b.txt").exists()
+
+
+def test_a_traceback_is_shown_to_who_asks_for_it(run, monkeypatch):
+    monkeypatch.setattr(ALIGN, "align", lambda *_, **__: {}["x"])
+    monkeypatch.setenv("DBDNET_DEBUG", "1")
+    status, _, err = run("a.ply", "b.ply")
+    assert status == FAILED and "Traceback" in err and "KeyError: 'x'" in err
+
+
+def test_a_name_does_not_steer_the_terminal(run, folder):
+    name = "a\x1b[2J\u202e.ply"
+    (folder / name).write_bytes((folder / "a.ply").read_bytes())
+    for options in ([], ["--json"]):
+        _, out, err = run(name, "b.ply", *options)
+        assert not {"\x1b", "\u202e"} & set(out + err) and r"a\x1b[2J\u202e.ply" in err
+
+
+def test_a_warning_is_a_line(run, monkeypatch):
+    def warn():
+        warnings.warn("odd\x1b", stacklevel=1)
+
+    monkeypatch.setattr("dbdnet_jax.io.programs.keep_compiled_programs", warn)
+    assert run("a.ply", "b.ply")[2] == "warning: odd\\x1b\na.ply -> b.ply ...\n"
+
+
+def test_a_reader_that_is_gone_ends_it_quietly(run, monkeypatch):
+    def gone(*_, **__):
+        raise BrokenPipeError(32, "Broken pipe")
+
+    monkeypatch.setattr("sys.stdout.flush", gone)
+    status, _, err = run("a.ply", "b.ply")
+    assert status == UNREAD and err == "a.ply -> b.ply ...\n"
 
 
 @pytest.mark.parametrize(("where", "moment"), [(ALIGN, "align"), (os, "fsync")])
@@ -152,7 +214,7 @@ def test_help_has_examples_and_the_exit_status_and_imports_nothing_heavy():
     code = (
         "import sys\nfrom dbdnet_jax import cli\n"
         "try: cli.main(['--help'])\n"
-        "finally: print(sorted({'scipy', 'trimesh', 'open3d'} & set(sys.modules)))"
+        "finally: print(sorted({'jax', 'numpy', 'trimesh'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert "examples:\n  dbdnet-register scan_a.ply scan_b.ply" in done.stdout

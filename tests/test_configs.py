@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -10,13 +11,47 @@ import pytest
 from ml_collections import ConfigDict
 
 from configs import cad, cad_short, modelnet, threedmatch
+from configs.peers import (
+    dcp,
+    dcp_cad,
+    finet,
+    finet_cad,
+    inenet,
+    inenet_cad,
+    masknet,
+    masknet_cad,
+    omnet,
+    omnet_cad,
+    rienet,
+    rienet_cad,
+)
 from dbdnet_jax.data.pairs import Protocol
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
-from dbdnet_jax.training.config import RunConfig, read_config, stage_record
+from dbdnet_jax.networks.masknet.network import MaskNetConfig
+from dbdnet_jax.networks.table import LEARNED
+from dbdnet_jax.training.config import default_config, read_config, stage_record
 from dbdnet_jax.training.losses import LossWeights
+from dbdnet_jax.training.table import STAGES
+from dbdnet_jax.training.task import RunConfig, TrainConfig
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = {"modelnet": modelnet, "threedmatch": threedmatch, "cad": cad, "cad_short": cad_short}
+PEERS = {
+    "masknet": masknet,
+    "dcp": dcp,
+    "rienet": rienet,
+    "omnet": omnet,
+    "finet": finet,
+    "inenet": inenet,
+}
+PEERS |= {
+    "masknet_cad": masknet_cad,
+    "dcp_cad": dcp_cad,
+    "rienet_cad": rienet_cad,
+    "omnet_cad": omnet_cad,
+    "finet_cad": finet_cad,
+    "inenet_cad": inenet_cad,
+}
 
 
 def train(*arguments: str) -> subprocess.CompletedProcess:
@@ -43,18 +78,40 @@ def with_change(**changes: object) -> ConfigDict:
     return config
 
 
-@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize("name", [*CONFIGS, *PEERS])
 def test_every_configuration_holds_exactly_the_fields_there_are(name):
-    config = CONFIGS[name].get_config()
-    assert isinstance(read_config(config), RunConfig)
-    for section, record in (("model", ModelConfig), ("protocol", Protocol)):
+    config = (CONFIGS | PEERS)[name].get_config()
+    found = read_config(config)
+    assert isinstance(found, RunConfig)
+    model = LEARNED[found.method].config
+    for section, record in (("model", model), ("protocol", Protocol), ("train", TrainConfig)):
         assert set(config[section]) == {field.name for field in dataclasses.fields(record)}
+    assert set(config) - set(found.stages) == {"method", "model", "data", "protocol", "train"}
 
 
-@pytest.mark.parametrize("name", CONFIGS)
+@pytest.mark.parametrize("name", [*CONFIGS, *PEERS])
 def test_configurations_are_locked(name):
     with pytest.raises(AttributeError, match="batchsize"):
-        CONFIGS[name].get_config().train.batchsize = 4
+        (CONFIGS | PEERS)[name].get_config().train.batchsize = 4
+
+
+@pytest.mark.parametrize("method", STAGES)
+def test_a_method_has_a_record_of_every_stage_and_defaults_for_all(method):
+    found = read_config(default_config(method))
+    assert found.method == method and set(found.stages) == set(STAGES[method])
+    assert set(LEARNED[method].parts) <= set(STAGES[method])  # a stage is named as its network
+    for stage in found.stages.values():
+        assert stage.epochs > 0 and stage.batch_size > 0 and stage.learning_rate > 0
+
+
+def test_masknets_optimizer_is_its_authors():
+    config = read_config(masknet.get_config())
+    assert config.model == MaskNetConfig()
+    stage = config.stages["masknet"]
+    assert (stage.epochs, stage.batch_size, stage.learning_rate) == (500, 32, 1e-4)
+    train = config.train
+    assert (train.optimizer, train.weight_decay, train.schedule) == ("adam", 0.0, "constant")
+    assert train.warmup_epochs == train.clip_norm == train.ema_decay == 0
 
 
 def test_modelnet_is_the_papers():
@@ -73,12 +130,12 @@ def test_modelnet_is_the_papers():
     assert config.train.learning_rate == config.train.weight_decay == 1e-4
     assert config.train.warmup_epochs == 5
     assert config.train.clip_norm == config.train.ema_decay == 0
-    assert config.overlap.gamma == 4
-    assert config.registration.weights == LossWeights(
+    assert config.stages["overlap"].gamma == 4
+    assert config.stages["registration"].weights == LossWeights(
         correspondence=5.0, rotation=1.0, translation=1.0, distance=1.0
     )
-    assert config.registration.masks == "predicted"
-    for stage in (config.overlap, config.registration):
+    assert config.stages["registration"].masks == "predicted"
+    for stage in (config.stages["overlap"], config.stages["registration"]):
         assert (stage.epochs, stage.batch_size, stage.learning_rate) == (300, 8, 1e-4)
 
 
@@ -86,10 +143,17 @@ def test_threedmatch_is_the_papers():
     config = read_config(threedmatch.get_config())
     assert config.model == ModelConfig()
     assert (config.protocol.points, config.protocol.overlap_radius) == (2048, 0.0375)
-    assert (config.overlap.epochs, config.overlap.batch_size) == (150, 2)
-    assert (config.registration.epochs, config.registration.batch_size) == (50, 1)
-    assert config.registration.weights == LossWeights(rotation=5.0)
-    assert config.overlap.learning_rate == config.registration.learning_rate == 1e-4
+    assert (config.stages["overlap"].epochs, config.stages["overlap"].batch_size) == (150, 2)
+    assert (config.stages["registration"].epochs, config.stages["registration"].batch_size) == (
+        50,
+        1,
+    )
+    assert config.stages["registration"].weights == LossWeights(rotation=5.0)
+    assert (
+        config.stages["overlap"].learning_rate
+        == config.stages["registration"].learning_rate
+        == 1e-4
+    )
 
 
 def test_the_cad_configurations_keep_the_papers_protocol():
@@ -103,7 +167,7 @@ def test_stages_follow_the_shared_fields_until_set():
     assert (config.overlap.batch_size, config.registration.batch_size) == (4, 4)
     config.registration.batch_size = 2
     config = read_config(config)
-    assert (config.overlap.batch_size, config.registration.batch_size) == (4, 2)
+    assert (config.stages["overlap"].batch_size, config.stages["registration"].batch_size) == (4, 2)
 
 
 def test_a_stage_may_resume_only_with_what_decides_its_outcome():
@@ -124,8 +188,11 @@ def test_a_stage_may_resume_only_with_what_decides_its_outcome():
         ({"data__name": "modelnet"}, r"one of \('cad', 'modelnet40', 'threedmatch'\); got 'mod"),
         ({"train__log_every": 30}, r"validate_every must be a multiple of .*log_every = 30"),
         ({"train__validation_pairs": 0}, r"validation_pairs must be at least 1; got 0"),
-        ({"overlap__epochs": 0.0}, r"config\.overlap must have epochs > 0"),
-        ({"joint__batch_size": 0}, r"config\.joint must have .*; got epochs=8.0, batch_size=0"),
+        ({"overlap__epochs": 0.0}, r"config\.overlap\.epochs must be positive; got 0"),
+        ({"method": "icp"}, r"config\.method must be one of dbdnet, masknet.*; got 'icp'"),
+        ({"train__optimizer": "sgd"}, r"optimizer must be one of \('adamw', 'adam'\); got 'sgd'"),
+        ({"train__schedule": "steps"}, r"milestones must be given for schedule='steps'"),
+        ({"joint__batch_size": 0}, r"config\.joint\.batch_size must be from 1 .*; got 0"),
         (
             {"data__augment": 1.5},
             r"config\.data\.augment must be in \[0, 1\].*; got 1\.5 for 'cad'",
@@ -139,11 +206,41 @@ def test_a_wrong_configuration_is_refused(changes, message):
         read_config(with_change(**changes))
 
 
-def test_a_missing_field_is_named():
+def leaves(section: ConfigDict, *path: str) -> list[tuple[str, ...]]:
+    """The dotted names of all fields, as tuples."""
+    found = []
+    for name, value in section.items():
+        inside = isinstance(value, ConfigDict)
+        found += leaves(value, *path, name) if inside else [(*path, name)]
+    return found
+
+
+@pytest.mark.parametrize("path", leaves(cad.get_config()), ids=".".join)
+def test_every_field_refuses_what_is_no_number_and_other_types(path):
+    for value in (float("nan"), float("inf"), -float("inf"), 1e300, None, [1], {"a": 1}, b"x"):
+        config = cad.get_config().to_dict()
+        section = config
+        for name in path[:-1]:
+            section = section[name]
+        section[path[-1]] = value
+        with pytest.raises(ValueError, match=rf"{re.escape('.'.join(path))} must be .*; got"):
+            read_config(ConfigDict(config))
+
+
+@pytest.mark.parametrize("field", ["heads", "neighbours", "overlap_channels", "iterations"])
+def test_a_network_of_nothing_is_refused_by_its_field(field):
+    with pytest.raises(ValueError, match=rf"in config\.model: {field} must be from"):
+        read_config(with_change(**{f"model__{field}": 0}))
+
+
+def test_a_missing_section_is_named_and_a_missing_field_has_its_default():
     config = with_change()
     with config.unlocked():
         del config.train["seed"]
-    with pytest.raises(ValueError, match=r"config must hold|config\.train .* lacks seed"):
+    assert read_config(config).train.seed == TrainConfig().seed
+    with config.unlocked():
+        del config["train"]
+    with pytest.raises(ValueError, match=r"every section of the method dbdnet; it lacks train"):
         read_config(config)
 
 
@@ -151,11 +248,22 @@ def test_a_missing_field_is_named():
     ("arguments", "message"),
     [
         (["--config=configs/cad.py", "--config.train.batchsize=4"], 'Did you mean "batch_size"'),
+        (["--config=configs/cad.py", "--config.model.heads=0"], "heads must be from 1"),
+        (["--config=configs/cad.py", "--config.train.learning_rate=nan"], "learning_rate must be"),
+        (["--config=configs/cad.py", "--stage=masknet"], "one of overlap, registration, joint for"),
         (["--config=configs/nothing.py"], "there is none at configs/nothing.py"),
         (["--config=configs/modelnet.py", "--config.data.folder=/nowhere"], "none at /nowhere"),
         (["--config=configs/threedmatch.py"], "Give --config.data.folder=PATH"),
     ],
-    ids=["misspelt field", "no such configuration", "no such folder", "no folder given"],
+    ids=[
+        "misspelt field",
+        "no heads",
+        "no number",
+        "stage of another method",
+        "no such configuration",
+        "no such folder",
+        "no folder given",
+    ],
 )
 def test_the_script_says_in_one_line_what_is_wrong(arguments, message, tmp_path):
     done = train(*arguments, f"--run_dir={tmp_path / 'run'}")

@@ -13,7 +13,7 @@ import pytest
 from dbdnet_jax.cli import _parser
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 NOTEBOOK = ROOT / "notebooks" / "quick_start.ipynb"
 OURS = r"(configs|examples|tests|tools|benchmarks|docs)/[^_]"  # folders; docs/_build is made
 

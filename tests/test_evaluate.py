@@ -13,10 +13,12 @@ from configs import cad
 from dbdnet_jax.data import test_pairs
 from dbdnet_jax.data.frozen import cad_test_pairs
 from dbdnet_jax.data.modelnet40 import FILES, load_modelnet40
+from dbdnet_jax.evaluation.methods import Weights
 from dbdnet_jax.evaluation.run import evaluate
 from dbdnet_jax.metrics.recall import correspondence_rmse_m
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
-from dbdnet_jax.networks.params import Params, parameter_shapes, unflatten
+from dbdnet_jax.networks.params import Params, unflatten
+from dbdnet_jax.networks.table import parameter_shapes
 from dbdnet_jax.networks.weights import save_params
 from dbdnet_jax.training.config import RunConfig, read_config
 from tests.data.test_modelnet40 import LABELS, write_file
@@ -124,9 +126,11 @@ def test_scans_are_the_benchmarks_pairs_and_come_without_normals(tmp_path):
 
 
 def test_params_without_a_registration_network_are_refused(tmp_path):
-    params = Params(overlap={}, registration=None, config=ModelConfig())
-    with pytest.raises(ValueError, match="needs a registration network.*--stage=registration"):
-        evaluate(params, asked_for(cad_config(), tmp_path), seed=0, command="")
+    params = Params({"overlap": {}}, ModelConfig())
+    with pytest.raises(
+        ValueError, match="needs a registration network.*hold only overlap.*--stage=registration"
+    ):
+        evaluate([Weights("", params)], asked_for(cad_config(), tmp_path), seed=0, command="")
 
 
 def test_the_script_prints_the_table_and_writes_it(tmp_path):
@@ -140,7 +144,7 @@ def test_the_script_prints_the_table_and_writes_it(tmp_path):
     assert content["pairs"] == 2 and content["pairs_hash"] in done.stdout
     assert content["command"].startswith("python evaluate.py --config=configs/cad.py")
     assert {row["method"] for row in content["rows"] if row["overlap_f1"] is not None} == {
-        "DBDNet", "DBDNet (untrained)", "all points overlapping (constant)",
+        "DBDNet", "DBDNet (untrained)", "align, DBDNet", "all points overlapping (constant)",
     }  # fmt: skip
     assert (tmp_path / "evaluation_cad_test_all_first_2.csv").is_file()
     page = (tmp_path / "evaluation_cad_test_all_first_2.html").read_text()

@@ -24,6 +24,19 @@ def test_signatures_are_not_checked_for_users():
     subprocess.run([sys.executable, "-c", command], check=True, cwd=Path(__file__).parents[1])
 
 
+def test_aligning_needs_no_library_of_training():
+    """All that the train extra brings, and the others, are absent; the weights load and serve."""
+    extras = """optax orbax grain h5py ml_collections tensorboardX tqdm open3d plotly matplotlib
+    jinja2"""
+    command = f"""
+import sys
+sys.modules.update(dict.fromkeys({extras.split()}))
+import dbdnet_jax, dbdnet_jax.cli
+dbdnet_jax.load_pretrained("cad")
+"""
+    subprocess.run([sys.executable, "-c", command], check=True, cwd=Path(__file__).parents[1])
+
+
 def test_silent_rank_promotion_is_refused():
     with pytest.raises(ValueError, match="rank_promotion"):
         jnp.zeros((5, 3)) + jnp.zeros(3)

@@ -1,129 +1,175 @@
-"""Fit the success probability of `align` on validation pairs, and show how far to trust it.
+"""Fit what ranks the poses of `align`, and its success probability; show how far to trust it.
 
-    python -m tools.fit_success --params=cad
+    python -m tools.fit_success --params=cad --count=400
     python -m tools.fit_success --params=cad --check   # only measure, on 3 x 200 frozen test pairs
 
-Writes the coefficients beside the weights. The figures printed for the fit are of five folds by
-shape: no pair is judged by coefficients that have seen its shape.
+Poses of every pair are found once and kept in ``--records``, so an interrupted run goes on where
+it was; delete that file when weights or code have changed. Writes the coefficients beside the
+weights. The figures printed for the fit are of five folds by shape: no pair is judged by
+coefficients that have seen its shape.
 """
 
 import argparse
-import importlib
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from unittest import mock
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from scipy.optimize import minimize
 from tqdm import tqdm
 
-from dbdnet_jax.alignment.align import align
+from dbdnet_jax.alignment.align import MAX_POINTS, align
+from dbdnet_jax.alignment.candidates import Candidate, examine, far_starts, merged, near_starts
+from dbdnet_jax.alignment.finding import settle
+from dbdnet_jax.alignment.normalised import as_given, normalise_pair
+from dbdnet_jax.alignment.search import NetworkPose, predict_pose
 from dbdnet_jax.alignment.success import (
     SUCCESS_DEG,
     SUCCESS_FILE,
+    SUCCESS_PART,
     Coefficients,
+    FitFeatures,
+    Logistic,
     PoseFeatures,
-    load_coefficients,
+    fit_features,
 )
-from dbdnet_jax.alignment.success import success_probability as probability_of
-from dbdnet_jax.data.cad import cad_split
+from dbdnet_jax.alignment.surfaces import PoseFit
+from dbdnet_jax.alignment.transforms import Transform, move, turn_deg
 from dbdnet_jax.data.frozen import cad_test_pairs
-from dbdnet_jax.data.pairs import Protocol, make_pair
 from dbdnet_jax.io.files import write_atomic
+from dbdnet_jax.io.programs import keep_compiled_programs
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import load_named
-from dbdnet_jax.types import Pair
+from tools.scan_pairs import ScanPair, scan_pair
 
-VARIANTS = ("noise", "clean", "disjoint")  # of the frozen test pairs, in the order of:
+VARIANTS = ("noise", "clean", "disjoint")  # of the frozen test pairs
 TEST_PAIRS = 200
-PROTOCOLS = (Protocol(), Protocol(noise_sigma=0.0), Protocol(disjoint=True))
-SEED = 77
-ALIGN = importlib.import_module("dbdnet_jax.alignment.align")  # not the function of that name
 FOLDS, BINS = 5, 10
-NOTHING = Coefficients(
-    *(PoseFeatures(*[x] * len(PoseFeatures._fields)) for x in (0.0, 1.0, 0.0)), bias=0.0
-)
-RIDGE = 1.0  # on the weights of standardised evidence, in units of one pair's loss
+RIDGE = 1.0  # on the weights of standardised features, in units of one pair's loss
+# Ranks poses before there is anything to rank them by.
+PLAIN = Logistic((0.0,) * 5, (1.0,) * 5, (2.0, 3.0, 0.0, 3.0, 0.0), 0.0)
+UNSURE = Logistic(*((x,) * len(PoseFeatures._fields) for x in (0.0, 1.0, 0.0)), 0.0)
 
 
-def validation_pairs(count: int) -> Iterator[tuple[int, Pair]]:
-    """Shape number and pair: shapes in turn, protocols in turn."""
-    shapes = cad_split("val")
-    for i, key in enumerate(jax.random.split(jax.random.key(SEED), count)):
-        row, protocol = i % len(shapes), PROTOCOLS[i // len(shapes) % len(PROTOCOLS)]
-        yield row, jax.device_get(_draw[protocol](key, shapes.points[row], shapes.normals[row]))
+class Record(NamedTuple):
+    """What is kept of a pair: its poses, how they fit and whether they are right.
+
+    Found near the given orientation, and everywhere.
+    """
+
+    near: list[tuple[list, PoseFit, bool]]
+    far: list[tuple[list, PoseFit, bool]]
+    network: list
+    source_overlap: list
+    target_overlap: list
 
 
-_draw = {
-    protocol: jax.jit(lambda *x, protocol=protocol: make_pair(*x, protocol))
-    for protocol in PROTOCOLS
-}
+def is_right(transform: Transform, pair: ScanPair) -> bool:
+    """Whether rotation and place are those of the pair."""
+    low, high = np.percentile(pair.target, [1, 99], axis=0)
+    middle = pair.source.mean(axis=0)
+    shift = np.linalg.norm(move(transform, middle) - move(pair.target_from_source, middle))
+    angle = turn_deg(transform[:3, :3].T @ pair.target_from_source[:3, :3])
+    return bool(angle < SUCCESS_DEG and shift < SUCCESS_PART * np.linalg.norm(high - low))
 
 
-def test_pairs(variant: str) -> Iterator[tuple[int, Pair]]:
-    """The frozen test pairs of one variant."""
-    pairs, _ = cad_test_pairs(variant)
-    for i in range(TEST_PAIRS):
-        yield i, jax.tree.map(lambda leaf: leaf[i], pairs)  # noqa: B023
+def find(params: Params, pair: ScanPair, coefficients: Coefficients) -> Record:
+    """The poses of a pair."""
+    scene = normalise_pair(pair.source, pair.target, "auto", MAX_POINTS, np.eye(4))
+    source, target = scene.source.surface, scene.target.surface
+    predicted = predict_pose(params, scene.source.sparse, scene.target.sparse)
+    lists = [
+        [
+            (x.pose.tolist(), x.fit, is_right(as_given(x.pose, scene), pair))
+            for x in examine(starts, source, target, coefficients)
+        ]
+        for starts in (near_starts(predicted.transform, source), far_starts(source, target))
+    ]
+    overlaps = predicted.source_overlap.tolist(), predicted.target_overlap.tolist()
+    return Record(*lists, predicted.transform.tolist(), *overlaps)
 
 
-def examine(params: Params, pairs: Iterator[tuple[int, Pair]], count: int):
-    """Features (n, fields), success (n,), shape numbers (n,), rotation errors (n,) in degrees."""
-    rows, shapes, errors = [], [], []
-    for shape, pair in tqdm(pairs, total=count):
-        # The coefficients at hand may be of other evidence, and are what is to be made here.
-        with mock.patch.object(ALIGN, "load_coefficients", lambda: NOTHING):
-            answer = align(pair.source.points, pair.target.points, params)
-        delta = answer.rotation.T @ pair.target_from_source.rotation
-        rows.append(answer.evidence)
-        shapes.append(shape)
-        errors.append(np.degrees(np.arccos(np.clip((np.trace(delta) - 1) / 2, -1, 1))))
-    errors = np.array(errors)
-    return np.array(rows), errors < SUCCESS_DEG, np.array(shapes), errors
+def records(params: Params, count: int, path: Path) -> Iterator[tuple[ScanPair, Record]]:
+    """Every pair and its poses: those in the file, then new ones, which are added to it."""
+    held = path.read_text().splitlines() if path.exists() else []
+    coefficients = Coefficients(PLAIN, UNSURE)
+    for number in tqdm(range(count)):
+        pair = scan_pair(number)
+        if number < len(held):
+            yield pair, Record(*json.loads(held[number]))
+            continue
+        record = find(params, pair, coefficients)
+        with open(path, "a") as file:
+            file.write(json.dumps(record) + "\n")
+        yield pair, record
 
 
-def fit(evidence: np.ndarray, success: np.ndarray) -> dict:
-    """Coefficients of a ridge logistic regression on standardised evidence."""
-    mean, deviation = evidence.mean(0), evidence.std(0) + 1e-9
-    x = np.hstack([(evidence - mean) / deviation, np.ones((len(evidence), 1))])
-    sign = np.where(success, 1.0, -1.0)
+def candidates(kept: list, rank: Logistic) -> list[Candidate]:
+    """Poses of a record under other coefficients, best first."""
+    found = [Candidate(np.array(pose), PoseFit(*fit), 0.0) for pose, fit, _ in kept]
+    scored = [x._replace(score=rank.logit(fit_features(x.fit))) for x in found]
+    return sorted(scored, key=lambda x: -x.score)
+
+
+def judged(
+    pair: ScanPair, record: Record, coefficients: Coefficients
+) -> Iterator[tuple[PoseFeatures, bool, bool]]:
+    """Features of the answer near the given orientation and everywhere, and whether it is right."""
+    scene = normalise_pair(pair.source, pair.target, "auto", MAX_POINTS, np.eye(4))
+    overlaps = (np.array(x) for x in (record.source_overlap, record.target_overlap))
+    nothing: Any = np.zeros((0, 0))
+    predicted = NetworkPose(np.array(record.network), *overlaps, nothing, nothing, nothing, True)
+    near, far = (candidates(x, coefficients.rank) for x in (record.near, record.far))
+    every = merged(near, far, middle=scene.source.surface.points.mean(axis=0))
+    for some, everywhere in ((near, False), (every, True)):
+        found = settle(scene, some, predicted, coefficients, None, everywhere=everywhere)
+        yield found.evidence, is_right(as_given(found.pose, scene), pair), everywhere
+
+
+def rank_rows(record: Record) -> tuple[list[FitFeatures], list[bool]]:
+    """Features of every pose of a pair, and which are right."""
+    every = [*record.near, *record.far]
+    return [fit_features(PoseFit(*fit)) for _, fit, _ in every], [right for *_, right in every]
+
+
+def fit(features: np.ndarray, right: np.ndarray) -> Logistic:
+    """A ridge logistic regression on standardised features."""
+    mean, deviation = features.mean(0), features.std(0) + 1e-9
+    x = np.hstack([(features - mean) / deviation, np.ones((len(features), 1))])
+    sign = np.where(right, 1.0, -1.0)
 
     def loss(w):
         return np.logaddexp(0, -sign * (x @ w)).sum() + RIDGE * (w[:-1] ** 2).sum() / 2
 
     w = minimize(loss, np.zeros(x.shape[1]), method="BFGS").x
-    parts = {"mean": mean, "deviation": deviation, "weight": w[:-1]}
-    named = {k: PoseFeatures(*map(float, v))._asdict() for k, v in parts.items()}
-    return named | {"bias": float(w[-1])}
+    return Logistic(*(tuple(map(float, v)) for v in (mean, deviation, w[:-1])), float(w[-1]))
 
 
-def predict(evidence: np.ndarray, fitted: dict) -> np.ndarray:
+def predict(features: np.ndarray, fitted: Logistic) -> np.ndarray:
     """Probabilities under coefficients."""
-    mean, deviation, weight = (
-        np.array(list(fitted[k].values())) for k in ("mean", "deviation", "weight")
-    )
-    return 1 / (1 + np.exp(-((evidence - mean) / deviation @ weight + fitted["bias"])))
+    mean, deviation, weight = (np.array(part) for part in fitted[:3])
+    return 1 / (1 + np.exp(-((features - mean) / deviation @ weight + fitted.bias)))
 
 
-def held_out(evidence: np.ndarray, success: np.ndarray, shapes: np.ndarray) -> np.ndarray:
-    """Probability of every pair under a fit without its shape."""
-    probability = np.zeros(len(success))
+def held_out(features: np.ndarray, right: np.ndarray, shapes: np.ndarray) -> np.ndarray:
+    """Probability of every row under a fit without its shape."""
+    probability = np.zeros(len(right))
     for fold in range(FOLDS):
         mine = shapes % FOLDS == fold
-        probability[mine] = predict(evidence[mine], fit(evidence[~mine], success[~mine]))
+        probability[mine] = predict(features[mine], fit(features[~mine], right[~mine]))
     return probability
 
 
-def area_under_curve(probability: np.ndarray, success: np.ndarray) -> float:
+def area_under_curve(probability: np.ndarray, right: np.ndarray) -> float:
     """The chance that a right pose gets a higher probability than a wrong one."""
-    right, wrong = probability[success], probability[~success]
-    above = (right[:, None] > wrong).mean() if right.size and wrong.size else np.nan
-    return float(above + (right[:, None] == wrong).mean() / 2)
+    above, below = probability[right], probability[~right]
+    higher = (above[:, None] > below).mean() if above.size and below.size else np.nan
+    return float(higher + (above[:, None] == below).mean() / 2)
 
 
-def show(probability: np.ndarray, success: np.ndarray) -> dict:
+def show(probability: np.ndarray, right: np.ndarray) -> dict:
     """Print the reliability curve; return it, its calibration error and the area under the ROC."""
     print("probability      pairs   mean   right")
     error, curve = 0.0, []
@@ -131,51 +177,82 @@ def show(probability: np.ndarray, success: np.ndarray) -> dict:
     for low, high in zip(edges, edges[1:], strict=False):
         inside = (probability >= low) & ((probability < high) | (high == 1))
         if inside.any():
-            mean, right = probability[inside].mean(), success[inside].mean()
-            error += inside.mean() * abs(mean - right)
-            print(f"{low:.1f} .. {high:.1f} {inside.sum():12d} {mean:6.3f} {right:7.3f}")
-            curve.append({"pairs": int(inside.sum()), "mean": float(mean), "right": float(right)})
-    figures = {
-        "calibration_error": float(error),
-        "auc": area_under_curve(probability, success),
-        "reliability": curve,
-    }
-    print(f"{success.mean():.1%} of {len(success)} right (rotation off < {SUCCESS_DEG:g} degrees)")
-    print(f"expected calibration error {error:.3f}, area under the ROC curve {figures['auc']:.3f}")
-    return figures
+            mean, part = probability[inside].mean(), right[inside].mean()
+            error += inside.mean() * abs(mean - part)
+            print(f"{low:.1f} .. {high:.1f} {inside.sum():12d} {mean:6.3f} {part:7.3f}")
+            curve.append({"pairs": int(inside.sum()), "mean": float(mean), "right": float(part)})
+    auc = area_under_curve(probability, right)
+    print(f"{right.mean():.1%} of {len(right)} right ({SUCCESS_DEG:g} degrees, {SUCCESS_PART:.0%})")
+    print(f"expected calibration error {error:.3f}, area under the ROC curve {auc:.3f}")
+    return {"calibration_error": float(error), "auc": auc, "reliability": curve}
+
+
+def check(params: Params) -> None:
+    """The shipped probability on the frozen test pairs."""
+    found = []
+    for variant in VARIANTS:
+        pairs = jax.device_get(cad_test_pairs(variant)[0])
+        probability, right = [], []
+        for i in tqdm(range(TEST_PAIRS)):
+            pair = jax.tree.map(lambda leaf: leaf[i], pairs)  # noqa: B023
+            true = np.eye(4)
+            true[:3, :3], true[:3, 3] = pair.target_from_source
+            clouds = [np.float64(x.points[: int(x.count)]) for x in (pair.source, pair.target)]
+            answer = align(*clouds, params)
+            probability.append(answer.success_probability)
+            right.append(is_right(answer.transform, ScanPair(*clouds, true, i)))
+        print(f"\n{variant}:")
+        show(np.array(probability), np.array(right))
+        found.append((np.array(probability), np.array(right)))
+    print("\ntogether:")
+    show(*map(np.concatenate, zip(*found, strict=True)))
+
+
+def fit_all(params: Params, count: int, path: Path) -> dict:
+    """Both regressions, as they are written, and how far to trust the second one."""
+    held = list(records(params, count, path))
+    rows = [rank_rows(record) for _, record in held]
+    features = np.array([x for row in rows for x in row[0]])
+    rank = fit(features, np.array([x for row in rows for x in row[1]]))
+    judged_rows = [
+        (pair.shape, *answer)
+        for pair, record in tqdm(held)
+        for answer in judged(pair, record, Coefficients(rank, UNSURE))
+    ]
+    shapes, evidence, right, everywhere = map(np.array, zip(*judged_rows, strict=True))
+    success = fit(evidence, right)
+    probability = held_out(evidence, right, shapes)
+    figures = {}
+    for name, rows_of in (("near", ~everywhere), ("everywhere", everywhere)):
+        print(f"\n{name}:")
+        figures[name] = show(probability[rows_of], right[rows_of])
+    best = [max(zip(*row, strict=True), key=lambda x: rank.logit(x[0]))[1] for row in rows]
+    print(f"\na right pose among those found {np.mean([any(row[1]) for row in rows]):.1%}, ")
+    print(f"ranked first {np.mean(best):.1%}")
+    named = {}
+    for name, fitted, kind in (("rank", rank, FitFeatures), ("success", success, PoseFeatures)):
+        parts = zip(("mean", "deviation", "weight"), fitted[:3], strict=True)
+        named[name] = {part: kind(*values)._asdict() for part, values in parts}
+        named[name]["bias"] = fitted.bias
+        print(name, {k: round(v, 2) for k, v in named[name]["weight"].items()})
+    return named | {"about": {"pairs": count, "five_folds": figures}}
 
 
 def main() -> None:
     """Fit and write, or check."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--params", default="cad")
-    parser.add_argument("--pairs", type=int, default=582)
+    parser.add_argument("--count", type=int, default=400)
+    parser.add_argument("--records", type=Path, default=Path("fit_success.jsonl"))
     parser.add_argument("--check", action="store_true")
     parser.add_argument("--output", type=Path, default=SUCCESS_FILE)
     options = parser.parse_args()
+    keep_compiled_programs()
     params = load_named(options.params)
     if options.check:
-        held = load_coefficients(options.output)
-        found = []
-        for variant in VARIANTS:
-            evidence, success, _, _ = examine(params, test_pairs(variant), TEST_PAIRS)
-            probability = np.array([probability_of(PoseFeatures(*row), held) for row in evidence])
-            print(f"\n{variant}:")
-            show(probability, success)
-            found.append((probability, success))
-        print("\ntogether:")
-        show(*map(np.concatenate, zip(*found, strict=True)))
+        check(params)
         return
-    evidence, success, shapes, errors = examine(
-        params, validation_pairs(options.pairs), options.pairs
-    )
-    print(f"mean error {errors.mean():.2f}, median {np.median(errors):.2f} degrees")
-    figures = show(held_out(evidence, success, shapes), success)
-    fitted = fit(evidence, success)
-    for field, weight in fitted["weight"].items():
-        print(f"{field:14s} {weight:7.3f}")
-    about = {"pairs": len(success), "right": float(success.mean()), "five_folds": figures}
-    text = json.dumps(fitted | {"about": about}, indent=2)
+    text = json.dumps(fit_all(params, options.count, options.records), indent=2)
     options.output.parent.mkdir(exist_ok=True)
     write_atomic(options.output, (text + "\n").encode())
 

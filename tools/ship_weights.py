@@ -21,10 +21,11 @@ import jax
 from configs import cad
 from dbdnet_jax.data.frozen import CAD_VARIANTS, cad_test_pairs
 from dbdnet_jax.data.training_pairs import load_training_pairs
-from dbdnet_jax.evaluation.run import evaluate_method, from_network
+from dbdnet_jax.evaluation.methods import Method, from_network
+from dbdnet_jax.evaluation.run import evaluate_method
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import PRETRAINED, load_params, save_params
-from dbdnet_jax.training.checkpoint import STAGES, load_best
+from dbdnet_jax.training.checkpoint import load_best
 from dbdnet_jax.training.config import read_config
 from dbdnet_jax.types import Pair
 
@@ -41,7 +42,8 @@ def main() -> None:
         parser.error(f"give one or two runs; got {len(options.runs)}")
     overlap, registration = (_load(path) for path in (options.runs[0], options.runs[-1]))
     config = read_config(cad.get_config())
-    params = Params(overlap.overlap, registration.registration, config.model)
+    networks = {"overlap": overlap.overlap, "registration": registration.registration}
+    params = Params(networks, config.model)
     training = load_training_pairs(
         config.data,
         config.protocol,
@@ -51,7 +53,7 @@ def main() -> None:
     )
     metadata = {
         "protocol": dataclasses.asdict(config.protocol),
-        "pairs_seen": dict(zip(STAGES, options.pairs, strict=True)),
+        "pairs_seen": dict(zip(networks, options.pairs, strict=True)),
         "note": options.note,
         "shipped_from": subprocess.check_output(["git", "rev-parse", "HEAD"], text=True).strip(),
         "validation": _figures(params, jax.device_get(training.validation)),
@@ -72,10 +74,10 @@ def _load(path: Path) -> Params:
 
 def _figures(params: Params, pairs: Pair) -> dict:
     """The network's row over stacked pairs, without the time."""
-    summary = evaluate_method("DBDNet", from_network(params), pairs).summary
-    assert summary is not None and summary.overlap is not None
-    overlap = {f"overlap_{name}": round(x, 4) for name, x in summary.overlap._asdict().items()}
-    motion = {name: round(x, 4) for name, x in summary._asdict().items() if name != "overlap"}
+    row = evaluate_method(Method("DBDNet", from_network(params)), pairs)
+    assert row.summary is not None and row.overlap is not None
+    overlap = {f"overlap_{name}": round(x, 4) for name, x in row.overlap._asdict().items()}
+    motion = {name: round(x, 4) for name, x in row.summary._asdict().items()}
     return motion | overlap
 
 

@@ -3,33 +3,33 @@
 import dataclasses
 import itertools
 import time
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from dbdnet_jax.alignment import search
+from dbdnet_jax.alignment import finding
+from dbdnet_jax.alignment.finding import Found
 from dbdnet_jax.alignment.normalised import (
     NormalisedCloud,
     NormalisedPair,
     as_given,
-    is_full_resolution,
+    as_normalised,
     normalise_pair,
-    normalised_guess,
 )
-from dbdnet_jax.alignment.quality import assess_pose, inlier_distance, shared_point_score
-from dbdnet_jax.alignment.search import NetworkPose, Transform
-from dbdnet_jax.alignment.success import (
-    PoseFeatures,
-    gather,
-    load_coefficients,
-    success_probability,
-)
+from dbdnet_jax.alignment.search import NetworkPose
+from dbdnet_jax.alignment.success import PoseFeatures, load_coefficients
+from dbdnet_jax.alignment.transforms import Transform, as_transform
 from dbdnet_jax.alignment.validity import rejection_reason, warnings
+from dbdnet_jax.io.forks import require_own_jax
 from dbdnet_jax.io.point_files import read_point_file
+from dbdnet_jax.io.programs import loading_seconds
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import load_pretrained
 
+SEARCHES = ("auto", "near", "any")
+LISTED = 1.0  # alternatives whose score, a logarithm of odds, is lower by less are listed
 MAX_POINTS = 768  # the weights were trained on 717; a little more costs nothing
 
 
@@ -41,6 +41,18 @@ class Matches(NamedTuple):
     confidence: Float[np.ndarray, " k"]
 
 
+class Alternative(NamedTuple):
+    """Another pose that fits about as well.
+
+    ``margin`` is by how much its fit is worse (of the logarithm of the odds; below 0, better), and
+    ``inlier_ratio`` the part of the source that comes near the target.
+    """
+
+    transform: Transform
+    margin: float
+    inlier_ratio: float
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Alignment:
     """A pose, ``target ~ rotation @ source + translation``, in the clouds' own units.
@@ -50,7 +62,9 @@ class Alignment:
     ``inlier_ratio`` is the part of the moved source that is within ``inlier_distance`` of the
     target, ``rmse`` its distance. ``information`` (6, 6) is that of the point-to-plane residuals
     for a small rotation (radians) about ``pivot`` and a small translation, in the target's frame;
-    its inverse, where it has one, is the covariance. ``timings`` are seconds.
+    its inverse, where it has one, is the covariance. ``alternatives`` are other poses that fit
+    about as well, best first: of a symmetric shape its symmetries. ``timings`` are seconds;
+    ``programs`` are loading and compiling, which no other counts.
     """
 
     transform: Transform
@@ -68,6 +82,7 @@ class Alignment:
     pivot: Float[np.ndarray, "3"] = dataclasses.field(repr=False)
     evidence: PoseFeatures
     timings: dict[str, float]
+    alternatives: tuple[Alternative, ...] = dataclasses.field(default=(), repr=False)
 
     @property
     def verdict(self) -> str:
@@ -91,11 +106,13 @@ def align(
     params: Params | None = None,
     *,
     refine: bool = True,
+    search: str = "auto",
     scale: float | str = "auto",
     overlap_threshold: float = 0.5,
     max_points: int = MAX_POINTS,
     seed: int = 0,
     initial: Any = None,
+    proposals: Any = (),
 ) -> Alignment:
     """Find the motion that brings ``source`` onto ``target``.
 
@@ -103,100 +120,114 @@ def align(
       source: (n, 3) numbers, n >= 16, or a file; see `point_files.read_point_file`.
       target: the same, (m, 3), in the same unit.
       params: the network; the weights in the package, if None.
-      refine: refine the network's pose, from it and from near it, on up to 1,024 points of each
-        cloud.
+      refine: refine poses. Without, the network's pose (or a better one of those given) is the
+        answer, and nothing else is searched.
+      search: "near" for poses near the given orientation (or near ``initial``), "any" for all
+        rotations, "auto" for the latter only where the former leaves a doubt. Of poses that fit
+        alike the one nearest to the given orientation is the answer.
       scale: factor from the clouds' unit to the weights'; "auto" brings the larger cloud to the
         size of a partial scan of a shape in the unit sphere.
       overlap_threshold: probability above which a point enters the registration.
       max_points: of each cloud, for the network.
       seed: of the points drawn on a mesh; nothing else is random.
       initial: a guess of the transform (4, 4). The network sees the source turned by it, and the
-        guess itself stands for election beside the network's pose.
+        guess is left only where another pose fits clearly better.
+      proposals: transforms (k, 4, 4) of anyone's making, judged as the network's own pose is.
 
     Raises:
       ValueError: points or arguments of no use, or weights that are not there.
       OSError: a file that cannot be read.
+      RuntimeError: the process was forked after JAX was used, and would hang; spawn it.
     """
-    laps = {"start": time.perf_counter()}
-    _check_arguments(scale, overlap_threshold, max_points)
+    require_own_jax("align")
+    laps = {"start": _clock()}
+    loaded = loading_seconds()
+    _check_arguments(search, scale, overlap_threshold, max_points)
     guess = np.eye(4) if initial is None else _check_transform(initial)
+    proposed = [_check_transform(x, f"proposals[{i}]") for i, x in enumerate(proposals)]
     source = read_point_file(source, "source", seed=seed)
     target = read_point_file(target, "target", seed=seed + 1)
-    laps["read"] = time.perf_counter()
+    laps["read"] = _clock()
+    params = _with_threshold(params, overlap_threshold)
+    coefficients = load_coefficients()
+    laps["weights"] = _clock()
+    scene = normalise_pair(source.points, target.points, scale, max_points, guess)
+    laps["downsample"] = _clock()
+    found = finding.find_pose(
+        params,
+        scene,
+        coefficients,
+        search,
+        refine=refine,
+        guess=None if initial is None else as_normalised(guess, scene),
+        proposals=[as_normalised(transform, scene) for transform in proposed],
+    )
+    laps["search"] = _clock()
+    reason = rejection_reason(scene, found)
+    if not reason and refine:
+        reason = finding.mirror_reason(scene, found, coefficients)
+    laps["quality"] = _clock()
+    return _report(scene, found, reason, (*source.notes, *target.notes), laps, loaded)
+
+
+def _with_threshold(params: Params | None, overlap_threshold: float) -> Params:
+    """The network, or that of the package, with a threshold of its own."""
     params = load_pretrained() if params is None else params
     if params.overlap is None or params.registration is None:
         raise ValueError("params must hold both networks; one is None. Load a full set of weights.")
     config = dataclasses.replace(params.config, overlap_threshold=float(overlap_threshold))
-    params = dataclasses.replace(params, config=config)
-    laps["weights"] = time.perf_counter()
-    scene = normalise_pair(source.points, target.points, scale, max_points, guess)
-    laps["downsample"] = time.perf_counter()
-    predicted = search.predict_pose(params, scene.source.sparse, scene.target.sparse)
-    laps["network"] = time.perf_counter()
-    distance = inlier_distance(scene.source.dense, scene.target.dense)
-    starts = [predicted.transform]
-    if initial is not None:
-        starts.append(normalised_guess(scene))
-    pose = _select_pose(starts, scene, refine)
-    laps["refine"] = time.perf_counter()
-    found = _report(scene, predicted, pose, distance, laps)
-    notes = (*source.notes, *target.notes)
-    return dataclasses.replace(found, warnings=(*notes, *found.warnings)) if notes else found
-
-
-def _select_pose(starts: list[Transform], scene: NormalisedPair, refine: bool) -> Transform:
-    """The pose that fits best; if asked for, refined on few points, then on all that are kept."""
-    clouds = scene.source.sparse, scene.target.sparse
-    if refine:
-        best, _ = min(
-            (search.refine_multistart(pose, *clouds) for pose in starts), key=lambda found: found[1]
-        )
-        return search.refine(best, scene.source.dense, scene.target.dense)
-    if len(starts) == 1:
-        return starts[0]
-    return min(starts, key=lambda pose: search.truncated_rmse(pose, *clouds))
+    return dataclasses.replace(params, config=config)
 
 
 def _report(
     scene: NormalisedPair,
-    predicted: NetworkPose,
-    pose: Transform,
-    distance: float,
+    found: Found,
+    reason: str,
+    notes: tuple[str, ...],
     laps: dict[str, float],
+    loaded: float,
 ) -> Alignment:
     """Everything that is known of a pose, in the units and rows of the clouds as given."""
-    clouds = scene.source.sparse, scene.target.sparse
-    dense = search.move(pose, scene.source.dense), scene.target.dense
-    quality = assess_pose(*dense, distance)
-    alternative = search.strongest_alternative(pose, *clouds)
-    shared = shared_point_score(*dense, distance) if is_full_resolution(scene) else 0.0
-    evidence = gather(predicted, pose, quality, alternative, shared)
-    probability = success_probability(evidence, load_coefficients())
-    reason = rejection_reason(scene, predicted, quality, probability)
-    laps["quality"] = time.perf_counter()
+    quality = found.quality
     overlap = (
-        _everywhere(scene.source, predicted.source_overlap),
-        _everywhere(scene.target, predicted.target_overlap),
+        _everywhere(scene.source, found.predicted.source_overlap),
+        _everywhere(scene.target, found.predicted.target_overlap),
     )
-    laps["overlap"] = time.perf_counter()
+    laps["overlap"] = _clock()
     unit = np.repeat([1.0, scene.factor], 3)
     return Alignment(
-        transform=as_given(pose, scene),
+        transform=as_given(found.pose, scene),
         valid=not reason,
         reason=reason,
-        success_probability=probability,
-        warnings=tuple(warnings(scene, quality, alternative)),
+        success_probability=found.probability,
+        warnings=(*notes, *warnings(scene, found)),
         inlier_ratio=float(quality.inlier.mean()),
-        inlier_distance=distance / scene.factor,
+        inlier_distance=quality.distance / scene.factor,
         rmse=quality.rmse / scene.factor,
         source_overlap=overlap[0],
         target_overlap=overlap[1],
-        matches=_matches(predicted, scene),
+        matches=_matches(found.predicted, scene),
         information=quality.information * unit * unit[:, None],
         pivot=quality.pivot / scene.factor + scene.target.downsampled.centre,
-        evidence=evidence,
-        timings={name: end - start for (_, start), (name, end) in itertools.pairwise(laps.items())},
+        alternatives=tuple(_alternatives(found, scene)),
+        evidence=found.evidence,
+        timings={
+            "programs": loading_seconds() - loaded,
+            **{name: end - start for (_, start), (name, end) in itertools.pairwise(laps.items())},
+        },
     )
+
+
+def _clock() -> float:
+    """Seconds but for what loading or compiling programs takes: the first call's alone."""
+    return time.perf_counter() - loading_seconds()
+
+
+def _alternatives(found: Found, scene: NormalisedPair) -> Iterator[Alternative]:
+    """What fits about as well, as transforms of the clouds as given."""
+    for other in found.others:
+        if (margin := found.score - other.score) < LISTED:
+            yield Alternative(as_given(other.pose, scene), margin, other.fit.source_inliers)
 
 
 def _everywhere(side: NormalisedCloud, values: Float[np.ndarray, " s"]) -> Float[np.ndarray, " n"]:
@@ -222,8 +253,12 @@ def _matches(predicted: NetworkPose, scene: NormalisedPair) -> Matches:
     )
 
 
-def _check_arguments(scale: float | str, overlap_threshold: float, max_points: int) -> None:
-    """Refuse numbers of no use."""
+def _check_arguments(
+    search: str, scale: float | str, overlap_threshold: float, max_points: int
+) -> None:
+    """Refuse words and numbers of no use."""
+    if search not in SEARCHES:
+        raise ValueError(f"search must be one of {', '.join(SEARCHES)}; got {search!r}.")
     if scale != "auto" and not (isinstance(scale, int | float) and 0 < scale < np.inf):
         raise ValueError(f"scale must be 'auto' or a positive number; got {scale!r}.")
     if not 0 <= overlap_threshold < 1:
@@ -232,20 +267,20 @@ def _check_arguments(scale: float | str, overlap_threshold: float, max_points: i
         raise ValueError(f"max_points must be at least 64; got {max_points}. Use {MAX_POINTS}.")
 
 
-def _check_transform(values: Any) -> Transform:
+def _check_transform(values: Any, name: str = "initial") -> Transform:
     """A 4x4 rigid transform, its rotation made exact, or a ValueError."""
     try:
         transform = np.asarray(values, np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"initial must be a 4x4 array of numbers: {error}.") from error
+        raise ValueError(f"{name} must be a 4x4 array of numbers: {error}.") from error
     if transform.shape != (4, 4) or not np.isfinite(transform).all():
-        raise ValueError(f"initial must be 4x4 and finite; got shape {transform.shape}.")
+        raise ValueError(f"{name} must be 4x4 and finite; got shape {transform.shape}.")
     rotation = transform[:3, :3]
     skew = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if skew > 1e-3 or np.linalg.det(rotation) < 0 or (transform[3] != [0, 0, 0, 1]).any():
         raise ValueError(
-            "initial must be a rotation and a translation with a last row of 0 0 0 1; its rotation "
+            f"{name} must be a rotation and a translation with a last row of 0 0 0 1; its rotation "
             f"misses orthogonality by {skew:.2g}, with determinant {np.linalg.det(rotation):.3g}. "
             "Remove scale and reflection."
         )
-    return search.as_transform(rotation, transform[:3, 3])
+    return as_transform(rotation, transform[:3, 3])

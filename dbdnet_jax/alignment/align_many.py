@@ -18,7 +18,7 @@ from dbdnet_jax.alignment.pose_graph import (
     in_source_frame,
     optimise,
 )
-from dbdnet_jax.alignment.search import as_transform, move
+from dbdnet_jax.alignment.transforms import as_transform, move
 from dbdnet_jax.errors import load_open3d
 from dbdnet_jax.io.point_files import read_points
 from dbdnet_jax.networks.params import Params

@@ -1,62 +1,74 @@
 """From a cloud of any size, place and unit to the few even points that the network sees."""
 
+from bisect import bisect_left
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from dbdnet_jax.alignment.outliers import inlying
+from dbdnet_jax.alignment.voxels import MAX_CELLS, first_of_cells, voxel_keys
+
 Points = Float[np.ndarray, "n 3"]
 Rows = Int[np.ndarray, " k"]
 Fewer = Int[np.ndarray, " j"]
+Fewest = Int[np.ndarray, " i"]
 
-DENSE = 10_000  # points that a pose is refined and judged on; nothing is downsampled below
+DENSE = 10_000  # points that a pose is judged on; nothing is downsampled below
+EVEN = 1024  # farthest points that poses are searched and ranked on, the network's among them
 BLOCK = 1_000_000  # rows that a grid thins at once: bounds the memory
 SAMPLE = 200_000  # rows that decide a grid's step
-MAX_CELLS = 4096  # along an axis: twelve bits
-OUTLIER_DISTANCE = 3.0  # points farther from the middle than this times the size are left out
 # The size of a partial scan of a shape in the unit sphere: the median of the larger one of a pair
 # under the paper's protocol, on the training shapes. Its logarithm varies by 0.12.
 UNIT_SIZE = 0.95
 
 
 class Downsampled(NamedTuple):
-    """Rows of a cloud: ``dense`` for judging a pose, ``sparse`` of them for the network.
+    """Rows of a cloud: ``dense`` for the last step and for judging a pose.
 
-    ``centre`` (3,) and ``size`` describe the cloud without outliers, in its own unit.
+    ``even`` are places in these, farthest points first, to search poses on; ``sparse`` are the rows
+    of the first of them, for the network. ``centre`` (3,) and ``size`` describe the
+    cloud without outliers, in its own unit.
     """
 
     dense: Rows
-    sparse: Fewer
+    even: Fewer
+    sparse: Fewest
     centre: Float[np.ndarray, "3"]
     size: float
     outliers: int
 
 
 def downsample(points: Points, sparse: int, dense: int = DENSE) -> Downsampled:
-    """Choose rows: a voxel grid down to ``dense``, farthest points down to ``sparse``.
+    """Choose rows: without outliers, a voxel grid down to ``dense``, farthest points down to few.
 
     The choice does not depend on the order of the rows, but for the grid's step above `SAMPLE`
     points. Memory: about 100 bytes a point beside the points.
     """
-    middle = np.median(points, axis=0)
-    distance = np.linalg.norm(points - middle, axis=1)
-    reach = OUTLIER_DISTANCE * float(np.quantile(distance, 0.98))
-    rows = np.flatnonzero(distance <= reach)
+    rows = np.flatnonzero(inlying(points))
     outliers = len(points) - len(rows)
+    middle = np.median(points[rows], axis=0)
     if len(rows) > dense:
-        rows = _grid(points, rows, middle, reach, dense)
+        rows = _grid(points, rows, middle, dense)
+    else:  # in an order of their own
+        rows = rows[np.lexsort(points[rows].T)]
     middle = points[rows].mean(axis=0)
-    chosen = rows[farthest_rows(points[rows] - middle, sparse)]
+    even = farthest_rows(points[rows] - middle, max(EVEN, sparse))
+    chosen = rows[even[:sparse]]
     centre = points[chosen].mean(axis=0)
     size = np.quantile(np.linalg.norm(points[chosen] - centre, axis=1), 0.98)
-    return Downsampled(rows, chosen, centre, float(size), outliers)
+    return Downsampled(rows, even, chosen, centre, float(size), outliers)
 
 
-def _grid(points: Points, rows: Rows, middle: np.ndarray, reach: float, dense: int) -> Fewer:
+def _grid(points: Points, rows: Rows, middle: np.ndarray, dense: int) -> Fewer:
     """The finest grid, by steps of sqrt(2), that leaves at most ``dense`` rows."""
-    cell = 2.001 * reach / MAX_CELLS
-    while len(voxel_rows(points, rows[:: -(-len(rows) // SAMPLE)], middle, cell)) > dense:
-        cell *= 2**0.5
+    reach = float(np.abs(points[rows] - middle).max())
+    cells = 2.001 * reach / MAX_CELLS * 2.0 ** np.arange(0, 13, 0.5)
+    sample = rows[:: -(-len(rows) // SAMPLE)]
+    step = bisect_left(
+        cells, True, key=lambda c: len(voxel_rows(points, sample, middle, c)) <= dense
+    )
+    cell = cells[min(step, len(cells) - 1)]
     blocks = (rows[i : i + BLOCK] for i in range(0, len(rows), BLOCK))
     rows = np.concatenate([voxel_rows(points, block, middle, cell) for block in blocks])
     while len(rows := voxel_rows(points, rows, middle, cell)) > dense:
@@ -65,19 +77,9 @@ def _grid(points: Points, rows: Rows, middle: np.ndarray, reach: float, dense: i
 
 
 def voxel_rows(points: Points, rows: Rows, middle: Float[np.ndarray, "3"], cell: float) -> Fewer:
-    """Of every occupied cell of a cubic grid the row nearest to the cell's middle.
-
-    The grid may be at most `MAX_CELLS` wide; beyond, cells are taken for one another.
-    """
-    place = (points[rows] - middle) / cell
-    index = np.floor(place)
-    offset = ((place - index - 0.5) ** 2).sum(axis=1) / 0.75
-    index = index.astype(np.int64) & (MAX_CELLS - 1)
-    # One integer sorts by cell and, within it, by distance: 3 x 12 and 27 bits.
-    key = (index[:, 0] << 24 | index[:, 1] << 12 | index[:, 2]) << 27
-    key |= (offset * (2**27 - 1)).astype(np.int64)
-    order = np.argsort(key)
-    return rows[order[np.diff(key[order] >> 27, prepend=-1) != 0]]
+    """Of every occupied cell of a cubic grid the row nearest to the cell's middle."""
+    offsets = points[rows] - middle
+    return rows[first_of_cells(voxel_keys(offsets, cell), offsets, cell)]
 
 
 def farthest_rows(points: Points, count: int) -> Rows:

@@ -6,7 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from dbdnet_jax.alignment.downsampling import UNIT_SIZE, Downsampled, downsample
-from dbdnet_jax.alignment.search import Transform, as_transform, move
+from dbdnet_jax.alignment.surfaces import Surface, surface
+from dbdnet_jax.alignment.transforms import Transform, as_transform, move
 from dbdnet_jax.io.point_files import MIN_POINTS
 
 Points = Float[np.ndarray, "n 3"]
@@ -14,11 +15,11 @@ OtherPoints = Float[np.ndarray, "m 3"]
 
 
 class NormalisedCloud(NamedTuple):
-    """One cloud as given, the rows chosen of it, and these at the network's scale."""
+    """One cloud as given, the rows chosen of it, and these at the network's scale as a surface."""
 
     points: Points
     downsampled: Downsampled
-    dense: Float[np.ndarray, "d 3"]
+    surface: Surface
     sparse: Float[np.ndarray, "s 3"]
 
 
@@ -40,7 +41,7 @@ def normalise_pair(
     """Downsample, centre, turn and scale two clouds, in float64.
 
     Raises:
-      ValueError: a cloud whose points are at too few places.
+      ValueError: a cloud whose points are at too few places, or a scale beyond float32.
     """
     downsampled = downsample(source, max_points), downsample(target, max_points)
     for name, rows in zip(("source", "target"), downsampled, strict=True):
@@ -49,13 +50,18 @@ def normalise_pair(
                 f"{name} must have points at {MIN_POINTS} places at least; got "
                 f"{len(rows.sparse)}. Give more points."
             )
-    factor = UNIT_SIZE / max(rows.size for rows in downsampled) if scale == "auto" else float(scale)
+    size = max(rows.size for rows in downsampled)
+    factor = UNIT_SIZE / size if scale == "auto" else float(scale)
+    if not 1e-6 <= size * factor <= 1e6:
+        raise ValueError(
+            f"scale must bring the clouds to a size from 1e-6 to 1e6, of which the weights know "
+            f"{UNIT_SIZE:g}; scale={factor:g} makes {size * factor:g} of {size:g}. Use 'auto'."
+        )
 
     def side(points, rows, turn):
-        dense, sparse = (
-            (points[x] - rows.centre) @ turn.T * factor for x in (rows.dense, rows.sparse)
-        )
-        return NormalisedCloud(points, rows, dense, sparse)
+        dense = (points[rows.dense] - rows.centre) @ turn.T * factor
+        sparse = dense[rows.even[: len(rows.sparse)]]
+        return NormalisedCloud(points, rows, surface(dense, rows.even), sparse)
 
     return NormalisedPair(
         side(source, downsampled[0], guess[:3, :3]),
@@ -65,12 +71,12 @@ def normalise_pair(
     )
 
 
-def normalised_guess(scene: NormalisedPair) -> Transform:
-    """The guess where the source has been turned by it already: a translation."""
-    start = np.eye(4)
-    moved = move(scene.guess, scene.source.downsampled.centre)
-    start[:3, 3] = (moved - scene.target.downsampled.centre) * scene.factor
-    return start
+def as_normalised(transform: Transform, scene: NormalisedPair) -> Transform:
+    """A transform of the clouds as given as a pose of the scene; undoes `as_given`."""
+    pose = as_transform(transform[:3, :3] @ scene.guess[:3, :3].T, np.zeros(3))
+    moved = move(transform, scene.source.downsampled.centre)
+    pose[:3, 3] = (moved - scene.target.downsampled.centre) * scene.factor
+    return pose
 
 
 def as_given(pose: Transform, scene: NormalisedPair) -> Transform:
@@ -84,7 +90,9 @@ def as_given(pose: Transform, scene: NormalisedPair) -> Transform:
 def is_full_resolution(scene: NormalisedPair) -> bool:
     """Whether a pose is judged on all points of both clouds, but for outliers."""
     sides = scene.source, scene.target
-    return all(len(side.dense) + side.downsampled.outliers == len(side.points) for side in sides)
+    return all(
+        len(side.surface.points) + side.downsampled.outliers == len(side.points) for side in sides
+    )
 
 
 def size_ratio(scene: NormalisedPair) -> float:

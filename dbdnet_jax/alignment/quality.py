@@ -4,20 +4,21 @@ Everything here is NumPy in float64, at the network's scale (shapes in the unit 
 source already moved.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
+
+from dbdnet_jax.alignment.surfaces import Surface
 
 Points = Float[np.ndarray, "n 3"]
-OtherPoints = Float[np.ndarray, "m 3"]
 Direction = Float[np.ndarray, "3"]
 
-NEAREST_INLIER = 0.03  # of the unit: noise and the last error of a pose, for dense clouds
-NORMAL_NEIGHBOURS = 16  # at least; of dense clouds a 250th part, to reach beyond their noise
 # A motion is free when it changes the distances between the surfaces by less than this part of
 # itself (root mean square); estimated normals of a noisy plane vary by about half of it.
 DEGENERATE = 0.1
+# Unless so many points change theirs by so much of what they move; near an axis nothing does.
+STRONG, FEW, FEW_PART, STILL = 0.4, 20, 0.01, 0.02
 # Of `shared_point_score`: how near to 1 the ratio of distances is in 19 of 20 wrong poses of
 # validation pairs (being an inlier favours the point's own distance), and points enough to tell.
 CHANCE_RATIO = 0.95
@@ -51,34 +52,17 @@ class PoseQuality(NamedTuple):
     degenerate_motions: tuple[Motion, ...]
 
 
-def inlier_distance(source: Points, target: OtherPoints) -> float:
-    """How far apart two points of one surface may stand: twice the wider spacing of the two."""
-    from scipy.spatial import cKDTree
-
-    return max(
-        NEAREST_INLIER, *(2 * _spacing(points, cKDTree(points)) for points in (source, target))
-    )
-
-
-def _spacing(points: Points, tree: Any) -> float:
-    """The median distance from a point to the nearest other one."""
-    return float(np.median(tree.query(points, k=2)[0][:, 1]))
-
-
-def assess_pose(moved: Points, target: OtherPoints, distance: float) -> PoseQuality:
+def assess_pose(moved: Points, target: Surface, distance: float) -> PoseQuality:
     """Compare a moved source with a target; fewer than six inliers leave every motion free."""
-    from scipy.spatial import cKDTree
-
-    tree = cKDTree(target)
-    found, rows = tree.query(moved, distance_upper_bound=distance)
+    found, rows = target.tree.query(moved, distance_upper_bound=distance)
     inlier = np.isfinite(found)
     if inlier.sum() < 6:
         axes = [Motion(kind, axis) for kind in ("rotation", "translation") for axis in np.eye(3)]
         nothing = np.zeros((6, 6)), moved.mean(axis=0), 0.0, tuple(axes)
         return PoseQuality(inlier, distance, np.inf, np.inf, *nothing)
     points, rows = moved[inlier], rows[inlier]
-    normals = surface_normals(target, tree, rows)
-    residual = ((points - target[rows]) * normals).sum(axis=1)
+    normals = target.normals[rows]
+    residual = ((points - target.points[rows]) * normals).sum(axis=1)
     plane_rmse = float(np.sqrt(np.mean(residual**2)))
     pivot = points.mean(axis=0)
     arm = points - pivot
@@ -86,7 +70,7 @@ def assess_pose(moved: Points, target: OtherPoints, distance: float) -> PoseQual
     held = jacobian.T @ jacobian
     length = max(float(np.sqrt((arm**2).sum(axis=1).mean())), 1e-12)
     unit = np.repeat([1 / length, 1.0], 3)
-    min_eigenvalue, degenerate = _degenerate_motions(held * unit * unit[:, None] / len(points))
+    min_eigenvalue, degenerate = _degenerate_motions(jacobian * unit, arm / length)
     return PoseQuality(
         inlier,
         distance,
@@ -99,57 +83,63 @@ def assess_pose(moved: Points, target: OtherPoints, distance: float) -> PoseQual
     )
 
 
-def shared_point_score(moved: Points, target: OtherPoints, distance: float) -> float:
+def shared_point_score(moved: Points, target: Surface, distance: float) -> float:
     """How much closer the inliers are to points of the target than a spacing beside them.
 
     From 0 to `CHANCE_RATIO`. Two drawings of one surface leave it at 0 in any pose; points that
     both clouds have in common show, and in the right pose only, even where the shape is symmetric.
     Not for clouds that a grid has downsampled: its cells may coincide.
     """
-    from scipy.spatial import cKDTree
-
-    tree = cKDTree(target)
-    found, rows = tree.query(moved, distance_upper_bound=distance)
+    found, rows = target.tree.query(moved, distance_upper_bound=distance)
     inliers = np.flatnonzero(np.isfinite(found))
     if len(inliers) < 6:
         return 0.0
     inliers = inliers[:: -(-len(inliers) // ENOUGH_INLIERS)]
-    normals = surface_normals(target, tree, rows[inliers])
+    normals = target.normals[rows[inliers]]
     flattest = np.eye(3)[np.abs(normals).argmin(axis=1)]
     along = np.cross(normals, flattest)
-    along *= _spacing(target, tree) / np.linalg.norm(along, axis=1, keepdims=True)
+    along *= target.spacing / np.linalg.norm(along, axis=1, keepdims=True)
     steps = np.stack([along, -along, np.cross(normals, along), np.cross(along, normals)])
-    beside = np.minimum(tree.query(moved[inliers] + steps)[0], distance)
+    beside = np.minimum(target.tree.query(moved[inliers] + steps)[0], distance)
     usual = max(float(np.sqrt(np.mean(beside**2))), 1e-12)  # 0 where the target is one place
     return max(CHANCE_RATIO - float(np.sqrt(np.mean(found[inliers] ** 2))) / usual, 0.0)
 
 
-def surface_normals(
-    target: OtherPoints, tree: Any, rows: Int[np.ndarray, " k"]
-) -> Float[np.ndarray, "k 3"]:
-    """Unit normals at the given rows: the flattest direction of the nearest neighbours."""
-    _, near = tree.query(
-        target[rows], k=max(min(NORMAL_NEIGHBOURS, len(target)), len(target) // 250)
-    )
-    offsets = target[near] - target[near].mean(axis=1, keepdims=True)
-    return np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))[1][:, :, 0]
+def _degenerate_motions(
+    jacobian: Float[np.ndarray, "n 6"], arm: Float[np.ndarray, "n 3"]
+) -> tuple[float, tuple[Motion, ...]]:
+    """The smallest eigenvalue of what the points hold, and the motions that nothing holds.
 
-
-def _degenerate_motions(held: Float[np.ndarray, "6 6"]) -> tuple[float, tuple[Motion, ...]]:
-    """The smallest eigenvalue of ``held``, and the motions whose eigenvalue is below DEGENERATE^2.
-
-    Translations first; rotations are then judged with the best translation beside each, so that
-    a rotation about an axis elsewhere is found too.
+    Those are the ones whose eigenvalue is below DEGENERATE^2, but for those that a part of the
+    points holds by themselves, as an object on a wide floor does. Translations first; rotations
+    are then judged with the best translation beside each, so that a rotation about an axis
+    elsewhere is found too.
     """
+    held = jacobian.T @ jacobian / len(jacobian)
     values, axes = np.linalg.eigh(held[3:, 3:])
     slack = values < DEGENERATE**2
-    motions = [Motion("translation", axis) for axis in axes.T[slack]]
+    motions = [
+        Motion("translation", axis)
+        for axis in axes.T[slack]
+        if not _held_by_few(jacobian[:, 3:] @ axis, np.ones(len(arm)))
+    ]
     stiff = axes[:, ~slack]
     coupling = held[:3, 3:] @ stiff
     about = held[:3, :3] - coupling @ np.diag(1 / values[~slack]) @ coupling.T
     turning, turns = np.linalg.eigh(about)
-    motions += [Motion("rotation", axis) for axis in turns.T[turning < DEGENERATE**2]]
+    for value, axis in zip(turning, turns.T, strict=True):
+        shift = -stiff @ (coupling.T @ axis / values[~slack])
+        change = jacobian @ np.concatenate([axis, shift])
+        moved = np.linalg.norm(np.cross(axis, arm) + shift, axis=1)
+        if value < DEGENERATE**2 and not _held_by_few(change, moved):
+            motions.append(Motion("rotation", axis))
     return float(np.linalg.eigvalsh(held)[0]), tuple(motions)
+
+
+def _held_by_few(change: Float[np.ndarray, " n"], moved: Float[np.ndarray, " n"]) -> bool:
+    """Whether points enough change their distance from the surface by much of what they move."""
+    strong = (np.abs(change) > STRONG * moved) & (moved > STILL)
+    return bool(strong.sum() >= FEW and strong.mean() > FEW_PART)
 
 
 def in_words(motions: tuple[Motion, ...]) -> str:

@@ -1,65 +1,100 @@
-"""The probability that a pose is right, from quantities known without the true one.
+"""What ranks poses, and the probability that the chosen one is right, both without the true pose.
 
-A logistic regression, fitted by ``tools/fit_success.py`` on pairs of the validation split; its
+Two logistic regressions, fitted by ``tools/fit_success.py`` on validation shapes; their
 coefficients lie beside the weights they belong to.
 """
 
 import json
 import math
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import numpy as np
-
-from dbdnet_jax.alignment.quality import PoseQuality
-from dbdnet_jax.alignment.search import AlternativePose, NetworkPose, Transform, angle_between
+from dbdnet_jax.alignment.surfaces import PoseFit
 from dbdnet_jax.networks.weights import PRETRAINED
 
 SUCCESS_FILE = PRETRAINED / "cad_success.json"
-SUCCESS_DEG = 5.0  # a pose is right when its rotation is off by less
+SUCCESS_DEG = 5.0  # a pose is right when its rotation is off by less ...
+SUCCESS_PART = 0.05  # ... and the source's middle by less than this part of the target's extent
+
+
+class FitFeatures(NamedTuple):
+    """What ranks a pose: a large overlap alone is no merit, but a part that lies well is."""
+
+    tight: float  # logarithm of the part of both clouds that lies on the other's surface
+    tight_per_inlier: float  # logarithm of that part of the inliers
+    inliers: float  # logarithm of the smaller one of the parts that come near
+    normal_agreement: float
+    plane_rmse: float
 
 
 class PoseFeatures(NamedTuple):
-    """What speaks for or against a pose; every entry free of units."""
+    """What speaks for or against the chosen pose; every entry free of units."""
 
-    plane_rmse: float  # distance along the normals, root mean square, per inlier distance
+    tight: float
+    tight_per_inlier: float
+    inliers: float
+    normal_agreement: float
+    plane_rmse: float
     shared_point_score: float  # whether the clouds have points in common, see `quality`
-    overlap_confidence: float  # mean distance of the overlap probabilities from one half
+    overlap_agreement: float  # how well the network's overlap and the inliers agree
     min_eigenvalue: float  # logarithm of the least held motion's eigenvalue
-    refinement_angle: float  # logarithm of 1 + degrees from the network's pose to the refined one
-    refinement_drift: float  # the same between the pose and what refining it once more makes of it
-    ambiguity_margin: float  # logarithm of the best alternative's truncated RMSE per this pose's
-    ambiguity_count: float  # how many turns of the pose end in another one that fits about as well
+    network_angle: float  # logarithm of 1 + degrees from the network's pose
+    last_step_angle: float  # the same of the last refinement
+    ambiguity_margin: float  # score of the pose less that of the best other one
+    ambiguity_count: float  # how many others fit about as well
+    turn: float  # logarithm of 1 + degrees from the given orientation
+    everywhere: float  # 1 where all rotations were searched
 
 
-def gather(
-    predicted: NetworkPose,
-    pose: Transform,
-    quality: PoseQuality,
-    alternative: AlternativePose,
-    shared_point_score: float,
-) -> PoseFeatures:
-    """The evidence for a pose."""
-    overlap = predicted.source_overlap, predicted.target_overlap
-    return PoseFeatures(
-        plane_rmse=min(quality.plane_rmse / quality.distance, 1.0),
-        shared_point_score=shared_point_score,
-        overlap_confidence=float(np.mean([np.abs(p - 0.5).mean() for p in overlap])),
-        min_eigenvalue=math.log(max(quality.min_eigenvalue, 1e-6)),
-        refinement_angle=math.log1p(angle_between(pose, predicted.transform)[0]),
-        refinement_drift=math.log1p(alternative.refinement_drift_deg),
-        ambiguity_margin=alternative.margin,
-        ambiguity_count=alternative.alternatives,
-    )
+class Logistic(NamedTuple):
+    """A regression on standardised features: ``(x - mean) / deviation``."""
+
+    mean: tuple[float, ...]
+    deviation: tuple[float, ...]
+    weight: tuple[float, ...]
+    bias: float
+
+    def logit(self, features: tuple[float, ...]) -> float:
+        """The logarithm of the odds."""
+        parts = zip(features, self.mean, self.deviation, self.weight, strict=True)
+        return self.bias + sum(w * (x - m) / d for x, m, d, w in parts)
 
 
 class Coefficients(NamedTuple):
-    """Of the regression on standardised evidence: ``(x - mean) / deviation``."""
+    """What ranks poses by their fit, and what tells how probably the chosen one is right."""
 
-    mean: PoseFeatures
-    deviation: PoseFeatures
-    weight: PoseFeatures
-    bias: float
+    rank: Logistic
+    success: Logistic
+
+
+def fit_features(fit: PoseFit) -> FitFeatures:
+    """What ranks a pose."""
+    tight = fit.source_tight + fit.target_tight
+    inliers = fit.source_inliers + fit.target_inliers
+    return FitFeatures(
+        tight=math.log(math.sqrt(fit.source_tight * fit.target_tight) + 0.01),
+        tight_per_inlier=math.log(tight / max(inliers, 1e-9) + 0.01),
+        inliers=math.log(min(fit.source_inliers, fit.target_inliers) + 0.01),
+        normal_agreement=fit.normal_agreement,
+        plane_rmse=fit.plane_rmse,
+    )
+
+
+def fit_score(fit: PoseFit, coefficients: Coefficients) -> float:
+    """The logarithm of the odds that a pose is right, by its fit alone."""
+    return coefficients.rank.logit(fit_features(fit))
+
+
+def success_probability(evidence: PoseFeatures, coefficients: Coefficients) -> float:
+    """Probability that the pose is right, by `SUCCESS_DEG` and `SUCCESS_PART`."""
+    return 1 / (1 + math.exp(-min(max(coefficients.success.logit(evidence), -50.0), 50.0)))
+
+
+def _logistic(held: dict[str, Any], kind: type[FitFeatures] | type[PoseFeatures]) -> Logistic:
+    mean, deviation, weight = (
+        tuple(float(held[part][name]) for name in kind._fields) for part in PARTS
+    )
+    return Logistic(mean, deviation, weight, float(held["bias"]))
 
 
 def load_coefficients(path: Path = SUCCESS_FILE) -> Coefficients:
@@ -71,12 +106,11 @@ def load_coefficients(path: Path = SUCCESS_FILE) -> Coefficients:
     """
     try:
         held = json.loads(path.read_text())
-        return Coefficients(
-            mean=PoseFeatures(**held["mean"]),
-            deviation=PoseFeatures(**held["deviation"]),
-            weight=PoseFeatures(**held["weight"]),
-            bias=float(held["bias"]),
+        rank, success = (
+            _logistic(held[name], kind)
+            for name, kind in (("rank", FitFeatures), ("success", PoseFeatures))
         )
+        return Coefficients(rank, success)
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(
             f"{path} must hold the coefficients of the success probability; it does not "
@@ -84,9 +118,4 @@ def load_coefficients(path: Path = SUCCESS_FILE) -> Coefficients:
         ) from error
 
 
-def success_probability(evidence: PoseFeatures, coefficients: Coefficients) -> float:
-    """Probability that the rotation is off by less than `SUCCESS_DEG` degrees."""
-    mean, deviation, weight, bias = coefficients
-    terms = zip(evidence, mean, deviation, weight, strict=True)
-    logit = bias + sum(w * (x - m) / d for x, m, d, w in terms)
-    return 1 / (1 + math.exp(-min(max(logit, -50.0), 50.0)))
+PARTS = ("mean", "deviation", "weight")

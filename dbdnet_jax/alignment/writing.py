@@ -2,7 +2,6 @@
 
 import io
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -11,29 +10,6 @@ from jaxtyping import Float
 
 from dbdnet_jax.alignment.align import Alignment
 from dbdnet_jax.io.files import write_atomic
-
-TRANSFORM_ENDINGS = (".txt", ".json", ".npy")
-
-
-def check_output(path: Path, endings: tuple[str, ...]) -> None:
-    """Refuse, before any work is done, a file that could not be written.
-
-    Raises:
-      ValueError: another ending.
-      OSError: no such folder, or it is not writable.
-    """
-    if path.suffix.lower() not in endings:
-        raise ValueError(
-            f"the ending of an output must be one of {' '.join(endings)}; got {path}. Rename it."
-        )
-    if path.is_dir():
-        raise IsADirectoryError(f"an output must be a file; {path} is a folder. Name a file in it.")
-    if not path.parent.is_dir():
-        raise FileNotFoundError(
-            f"the folder of an output must exist; {path.parent} does not. Create it."
-        )
-    if not os.access(path.parent, os.W_OK):
-        raise PermissionError(f"the folder {path.parent} must be writable. Choose another.")
 
 
 def write_transform(path: Path, alignment: Alignment) -> None:
@@ -68,5 +44,9 @@ def as_json(alignment: Alignment) -> dict[str, Any]:
         "rmse": alignment.rmse if np.isfinite(alignment.rmse) else None,
         "information": alignment.information.tolist(),
         "pivot": alignment.pivot.tolist(),
+        "alternatives": [
+            other._asdict() | {"transform": other.transform.tolist()}
+            for other in alignment.alternatives
+        ],
         "seconds": alignment.timings,
     }

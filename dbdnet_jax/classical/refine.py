@@ -105,6 +105,45 @@ def refine_multistart(
     return jax.tree.map(lambda leaf: leaf[best], found)
 
 
+class Schedule(NamedTuple):
+    """The radii of a refinement, from ``first`` to ``last`` in so many steps, and its cap."""
+
+    first: float
+    last: float
+    iterations: int
+    cap: float
+
+
+@partial(jax.jit, static_argnames="schedule")
+def refine_each(
+    source: Cloud,
+    target: Cloud,
+    normals: tuple[Float[Array, "n 3"], Float[Array, "m 3"]],
+    starts: Rigid,
+    schedule: Schedule,
+) -> tuple[Rigid, Float[Array, " k"]]:
+    """Several poses refined from given normals, each for itself, and their truncated RMSE.
+
+    ``starts`` has a leading axis of k. No pose is kept where refining makes it worse: this is for
+    poses that are rough.
+    """
+    source, target = _zero_padding(source), _zero_padding(target)
+    centre = _middle(target.points, target)
+    target = target._replace(points=target.points - centre[None, :])
+    scene = _PreparedPair((source, target), normals, centre)
+    radii = jnp.geomspace(
+        schedule.first, schedule.last, schedule.iterations, dtype=source.points.dtype
+    )
+
+    def one(start: Rigid) -> tuple[Rigid, Float[Array, ""]]:
+        pose = Rigid(start.rotation, start.translation - centre)
+        pose = jax.lax.scan(lambda at, radius: (_step(scene, at, radius), None), pose, radii)[0]
+        rmse = _truncated_rmse(scene.views, pose, schedule.cap)
+        return Rigid(pose.rotation, pose.translation + centre), rmse
+
+    return jax.lax.map(one, starts)
+
+
 @jax.jit
 def truncated_rmse(
     source: Cloud, target: Cloud, target_from_source: Rigid, cap: float | Float[Array, ""] = CAP
@@ -134,9 +173,13 @@ def _downsample(cloud: Cloud) -> Cloud:
     return Cloud(jnp.where(prefix_mask(size, count)[:, None], cloud.points[rows], 0.0), count)
 
 
+def _zero_padding(cloud: Cloud) -> Cloud:
+    return cloud._replace(points=jnp.where(cloud.valid[:, None], cloud.points, 0.0))
+
+
 def _middle(points: Float[Array, "n 3"], cloud: Cloud) -> Float[Array, "3"]:
     """The mean of the valid rows of ``points``."""
-    total = jnp.sum(jnp.where(_valid(cloud)[:, None], points, 0.0), axis=0)
+    total = jnp.sum(jnp.where(cloud.valid[:, None], points, 0.0), axis=0)
     return total / jnp.maximum(cloud.count, 1)
 
 
@@ -144,16 +187,17 @@ def _turned(source: Cloud, pose: Rigid, angles_deg: tuple[float, ...]) -> Rigid:
     """The pose and its turns, stacked; see `refine_from_rotations`."""
     moved = rigid.apply(pose, source.points)
     middle = _middle(moved, source)
-    arms = jnp.where(_valid(source)[:, None], moved - middle[None, :], 0.0)
+    arms = jnp.where(source.valid[:, None], moved - middle[None, :], 0.0)
     axes = jnp.linalg.eigh(jnp.matmul(arms.T, arms, precision=HIGHEST))[1].T
     angles = jnp.deg2rad(jnp.array(angles_deg, moved.dtype))
     turns = jax.vmap(jax.vmap(rigid.rotation_about, (None, 0)), (0, None))(axes, angles)
-    turns = jnp.concatenate([jnp.eye(3)[None], turns.reshape(-1, 3, 3)])
-    there, back = Rigid(jnp.eye(3), -middle), Rigid(jnp.eye(3), middle)
+    identity = jnp.eye(3, dtype=moved.dtype)
+    turns = jnp.concatenate([identity[None], turns.reshape(-1, 3, 3)])
+    there, back = Rigid(identity, -middle), Rigid(identity, middle)
     level = rigid.compose(there, pose)
 
     def about_middle(turn):
-        return rigid.compose(back, rigid.compose(Rigid(turn, jnp.zeros(3)), level))
+        return rigid.compose(back, rigid.compose(Rigid(turn, jnp.zeros_like(middle)), level))
 
     return jax.vmap(about_middle)(turns)
 
@@ -162,7 +206,7 @@ def _refine(
     scene: _PreparedPair, initial: Rigid, cap: float | Float[Array, ""], iterations: int
 ) -> Refined:
     start = Rigid(initial.rotation, initial.translation - scene.centre)
-    radii = jnp.geomspace(FIRST_RADIUS, LAST_RADIUS, iterations)
+    radii = jnp.geomspace(FIRST_RADIUS, LAST_RADIUS, iterations, dtype=scene.centre.dtype)
     end = jax.lax.scan(lambda at, radius: (_step(scene, at, radius), None), start, radii)[0]
     before, after = (_truncated_rmse(scene.views, pose, cap) for pose in (start, end))
     accepted = after <= (1.0 + SLACK) * before
@@ -176,16 +220,12 @@ def _truncated_rmse(
 ) -> Float[Array, ""]:
     source, target = views
     squares = squared_distances(rigid.apply(motion, source.points), target.points)
-    rows, columns = _valid(source), _valid(target)
+    rows, columns = source.valid, target.valid
     squares = jnp.where(rows[:, None] & columns[None, :], squares, jnp.inf)
     squares = jnp.minimum(squares, jnp.square(cap))
     ways = jnp.where(rows, squares.min(axis=1), 0.0), jnp.where(columns, squares.min(axis=0), 0.0)
     total = sum(jnp.sum(way) for way in ways)
     return jnp.sqrt(total / jnp.maximum(source.count + target.count, 1))
-
-
-def _valid(cloud: Cloud) -> Bool[Array, " n"]:
-    return prefix_mask(len(cloud.points), cloud.count)
 
 
 def _step(scene: _PreparedPair, motion: Rigid, radius: Float[Array, ""]) -> Rigid:
@@ -197,11 +237,12 @@ def _step(scene: _PreparedPair, motion: Rigid, radius: Float[Array, ""]) -> Rigi
     source, target = scene.views
     normals = scene.normals
     moved = rigid.apply(motion, source.points)
+    one = jnp.eye(3, dtype=moved.dtype)
     across = _outer(jnp.matmul(normals[0], motion.rotation.T, precision=HIGHEST))
     target_across = _outer(normals[1])
     features = jnp.concatenate(
         [
-            jnp.ones((len(target.points), 1)),
+            jnp.ones((len(target.points), 1), moved.dtype),
             target.points,
             target_across.reshape(-1, 9),
             jnp.einsum("nij,nj->ni", target_across, target.points),
@@ -211,18 +252,19 @@ def _step(scene: _PreparedPair, motion: Rigid, radius: Float[Array, ""]) -> Rigi
     matching = _match(source._replace(points=moved), target, radius)
     sums = jnp.matmul(matching, features, precision=HIGHEST)
     mass, mean, metric, metric_mean = jnp.split(sums, [1, 4, 13], axis=1)
-    own = ISOTROPY * jnp.eye(3)[None] + (1 - ISOTROPY) * across
+    own = ISOTROPY * one[None] + (1 - ISOTROPY) * across
     metric = mass[:, :, None] * own + (1 - ISOTROPY) * metric.reshape(-1, 3, 3)
     # sum_j P_ij M_ij (s_i - q_j) of every source point
     pull = jnp.einsum("nij,nj->ni", metric, moved, precision=HIGHEST)
     pull -= jnp.einsum("nij,nj->ni", own, mean, precision=HIGHEST) + (1 - ISOTROPY) * metric_mean
-    identity = jnp.broadcast_to(jnp.eye(3), metric.shape)
+    identity = jnp.broadcast_to(one, metric.shape)
     jacobian = jnp.concatenate([-_cross(moved), identity], axis=2)
     hessian = jnp.einsum("nai,nab,nbj->ij", jacobian, metric, jacobian, precision=HIGHEST)
     gradient = jnp.einsum("nai,na->i", jacobian, pull, precision=HIGHEST)
     # The ridge holds motions that nothing resists; its constant, all of them where none matched.
     ridge = 1e-6 * jnp.trace(hessian) + 1e-12
-    turn, shift = jnp.split(-jnp.linalg.solve(hessian + ridge * jnp.eye(6), gradient), 2)
+    hessian += ridge * jnp.eye(6, dtype=moved.dtype)
+    turn, shift = jnp.split(-jnp.linalg.solve(hessian, gradient), 2)
     angle = jnp.sqrt(jnp.sum(turn * turn) + 1e-20)  # no division by zero at rest
     return rigid.compose(Rigid(rigid.rotation_about(turn / angle, angle), shift), motion)
 
@@ -231,7 +273,7 @@ def _match(moved: Cloud, target: Cloud, radius: Float[Array, ""]) -> Float[Array
     """Soft matching, the sum of both ways; what has little within the radius is hardly matched."""
     squares = squared_distances(moved.points, target.points)
     kernel = jnp.maximum(1.0 - squares / radius**2, 0.0) ** 2
-    kernel = jnp.where(_valid(moved)[:, None] & _valid(target)[None, :], kernel, 0.0)
+    kernel = jnp.where(moved.valid[:, None] & target.valid[None, :], kernel, 0.0)
     forth = 1.0 / (OUTLIER_MASS + kernel.sum(axis=1))
     back = 1.0 / (OUTLIER_MASS + kernel.sum(axis=0))
     return kernel * (forth[:, None] + back[None, :])

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import io
-import zipfile
-import zlib
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from dbdnet_jax.io.files import write_atomic
+from dbdnet_jax.io.files import warn_without_cache, write_atomic
 
 
 def nearest_within(
@@ -36,7 +34,8 @@ def overlap_labels(
     """Which points of two aligned clouds have a point of the other closer than ``radius``.
 
     ``cache`` is a folder, created if need be, where the answer is kept. The file there is named by
-    a hash of the input, so it may be missing or damaged (then it is written again), never stale.
+    a hash of the input, so it may be missing or damaged (then it is written again), never stale. A
+    folder that cannot be written costs a warning.
     """
     if cache is None:
         return nearest_within(source, target, radius)[0], nearest_within(target, source, radius)[0]
@@ -50,11 +49,13 @@ def overlap_labels(
                 np.unpackbits(stored["source"], count=len(source)).astype(bool),
                 np.unpackbits(stored["target"], count=len(target)).astype(bool),
             )
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
-        pass  # not there yet, or damaged
-    near_source, near_target = overlap_labels(source, target, radius)
-    file.parent.mkdir(parents=True, exist_ok=True)
+    except Exception:  # not there yet, or damaged: zipfile answers with a dozen types of error
+        near_source, near_target = overlap_labels(source, target, radius)
     labels = io.BytesIO()
     np.savez_compressed(labels, source=np.packbits(near_source), target=np.packbits(near_target))
-    write_atomic(file, labels.getbuffer())
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(file, labels.getbuffer())
+    except OSError as error:
+        warn_without_cache(str(error))
     return near_source, near_target

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from dbdnet_jax.ops import rigid
 from dbdnet_jax.ops.grouping import squared_distances
-from dbdnet_jax.ops.sampling import half_space_crop, prefix_mask, random_direction, resample
+from dbdnet_jax.ops.sampling import half_space_crop, random_direction, resample
 from dbdnet_jax.types import Cloud, Pair, Rigid
 
 
@@ -179,10 +179,10 @@ def perturbed_overlap(
     choice_key, motion_key = jax.random.split(key)
     choice = jax.random.uniform(choice_key)
     motion = perturbed_pose(motion_key, pair, max_angle_deg=30.0, shift_sigma=0.1)
-    source = pair.source._replace(points=rigid.apply(motion, pair.source.points))
-    labels = _overlap_labels(source, pair.target, overlap_radius)
+    aligned = pair.source._replace(points=rigid.apply(motion, pair.source.points))
+    labels = _overlap_labels(aligned, pair.target, overlap_radius)
     truth = pair.source_overlap, pair.target_overlap
-    valid = _valid(pair.source), _valid(pair.target)
+    valid = pair.source.valid, pair.target.valid
     source, target = (
         jnp.where(choice < 0.2, true, (choice < 0.4) | label) & rows
         for true, label, rows in zip(truth, labels, valid, strict=True)
@@ -202,15 +202,11 @@ def _overlap_labels(
 ) -> tuple[Bool[Array, " n"], Bool[Array, " m"]]:
     """Which points have a neighbour in the other cloud closer than ``radius``, once aligned."""
     near = squared_distances(aligned.points, target.points) < radius * radius
-    near &= _valid(aligned)[:, None] & _valid(target)[None, :]
+    near &= aligned.valid[:, None] & target.valid[None, :]
     return jnp.any(near, axis=1), jnp.any(near, axis=0)
-
-
-def _valid(cloud: Cloud) -> Bool[Array, " n"]:
-    return prefix_mask(len(cloud.points), cloud.count)
 
 
 def _centroid(cloud: Cloud) -> Float[Array, "3"]:
     """The mean of the valid points."""
-    points = jnp.where(_valid(cloud)[:, None], cloud.points, 0.0)
+    points = jnp.where(cloud.valid[:, None], cloud.points, 0.0)
     return jnp.sum(points, axis=0) / jnp.maximum(cloud.count, 1)

@@ -31,6 +31,7 @@ INFO_FILES = {  # the first name that is there; the second is the name in Predat
 }
 KEYS = ("src", "tgt", "rot", "trans", "overlap")
 POINTS = 2048
+READ_AHEAD = 4  # batches
 OVERLAP_RADIUS_M = 0.0375
 # Nothing else is opened: a path from an info file cannot leave the folder.
 FRAGMENT = re.compile(r"(?:train|test)/(\w[\w.-]*)/cloud_bin_([0-9]{1,6})\.pth")
@@ -261,13 +262,12 @@ def batches(
     points: int = POINTS,
     radius_m: float = OVERLAP_RADIUS_M,
     cache: str | Path | None = None,
-    read_ahead: int = 4,
 ) -> Iterator[Pair]:
     """Training batches without end, from step ``start_step``: every array with a batch axis first.
 
     Batch ``step`` depends on (seed, step) only, so a run resumed with ``start_step`` sees what the
     unbroken run would have seen. Every epoch is a new order and a new draw of points; a batch may
-    span two epochs. Two threads load up to ``read_ahead`` batches ahead of the caller; an error in
+    span two epochs. Two threads load up to `READ_AHEAD` batches ahead of the caller; an error in
     one of them is raised by ``next``.
     """
     import grain
@@ -288,7 +288,5 @@ def batches(
     # The remainder is that of the endless order; kept, batches of 1 overflow Grain's length.
     steps = order.map_with_index(load).batch(batch_size, drop_remainder=True)[start_step:]
     return iter(
-        steps.to_iter_dataset(
-            grain.ReadOptions(num_threads=min(2, read_ahead), prefetch_buffer_size=read_ahead)
-        )
+        steps.to_iter_dataset(grain.ReadOptions(num_threads=2, prefetch_buffer_size=READ_AHEAD))
     )

@@ -18,6 +18,7 @@ from jaxtyping import Array, Int, PRNGKeyArray
 from dbdnet_jax.data.augment import make_augmented_pair, require_enough_points
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.config import DataConfig
+from dbdnet_jax.data.mixture import Mixture, Stock, make_mixture_pair, stock_of
 from dbdnet_jax.data.modelnet40 import load_modelnet40
 from dbdnet_jax.data.pairs import Protocol, make_pair
 from dbdnet_jax.data.procedural.shapes import procedural_shapes
@@ -68,6 +69,7 @@ def load_training_pairs(
         seed=seed,
         validation_pairs=validation_pairs,
         augment=data.augment,
+        mixture=data.mixture,
     )
 
 
@@ -95,10 +97,12 @@ def pairs_of_shapes(
     seed: int,
     validation_pairs: int,
     augment: float = 0.0,
+    mixture: Mixture | None = None,
 ) -> PairStream:
     """Pairs drawn on the device; every epoch sees every shape once, in an order of its own.
 
-    Of the training pairs a share of ``augment`` is drawn by `make_augmented_pair`.
+    The parts of ``mixture`` have their shares of the training pairs (`make_mixture_pair`); of the
+    others a share of ``augment`` is drawn by `make_augmented_pair`.
 
     Raises:
         ValueError: no shape to train or to validate on, or shapes of too few points.
@@ -108,14 +112,26 @@ def pairs_of_shapes(
             "training and validation need at least one shape each; got "
             f"{len(train)} and {len(validation)}. Choose other config.data.categories."
         )
+    mixed = mixture.total if mixture is not None else 0.0
     if augment:
         require_enough_points(train.points.shape[1], protocol)
+    held: Array | np.ndarray | Stock = stock_of(train.points) if mixed else train.points
     count = len(train)
     order_key = jax.random.key(seed)
 
-    def draw(key: PRNGKeyArray, number: Int[Array, ""], points: Any) -> Pair:
+    def draw(key: PRNGKeyArray, number: Int[Array, ""], arrays: Any) -> Pair:
         order = jax.random.permutation(jax.random.fold_in(order_key, number // count), count)
-        shape = points[order[number % count]]
+        row = order[number % count]
+        if mixture is not None and mixed:
+            mixed_key, key = jax.random.split(key)
+            return jax.lax.cond(
+                jax.random.uniform(mixed_key) < mixed,
+                lambda: make_mixture_pair(key, row, arrays, mixture, protocol),
+                lambda: draw_of(key, arrays.points[row]),
+            )
+        return draw_of(key, arrays[row])
+
+    def draw_of(key: PRNGKeyArray, shape: Array) -> Pair:
         normals = jnp.zeros_like(shape)  # nothing trains on them
         if not augment:
             return make_pair(key, shape, normals, protocol)
@@ -128,7 +144,7 @@ def pairs_of_shapes(
 
     return PairStream(
         epoch_pairs=count,
-        arrays=lambda start: itertools.repeat(train.points),
+        arrays=lambda start: itertools.repeat(held),
         draw=draw,
         validation=_fixed_pairs(validation, protocol, validation_pairs),
     )
@@ -159,7 +175,7 @@ def _scans(
     options: dict[str, Any] = {
         "points": protocol.points,
         "radius_m": protocol.overlap_radius,
-        "cache": cache_folder() / "threedmatch",
+        "cache": cache_folder("threedmatch"),
     }
     count = min(validation_pairs, len(validation))
     rows = [i * len(validation) // count for i in range(count)]

@@ -1,7 +1,6 @@
 """The page about an evaluation: its tables, how errors spread, pairs to look at, and sweeps."""
 
 import csv
-import html
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,34 +9,24 @@ from jaxtyping import Float
 
 from dbdnet_jax.drawing import figures
 from dbdnet_jax.drawing.figures import Curve
-from dbdnet_jax.drawing.page import Markup, card, grid, page, plot, table, tag
+from dbdnet_jax.drawing.page import Plot, render
 from dbdnet_jax.evaluation.run import Evaluation, Row
 from dbdnet_jax.evaluation.sweep import SWEEPS
-from dbdnet_jax.evaluation.tables import Table, tables
+from dbdnet_jax.evaluation.tables import tables
 
 LEAST_DEG, LEAST_UNIT = 1e-2, 1e-4  # where the logarithmic axes begin
 
 
 def evaluation_page(evaluation: Evaluation, run_dir: str | Path) -> bytes:
     """A self-contained HTML file of an evaluation and of the sweeps in ``run_dir``."""
-    title = f"{evaluation.pairs} pairs of {evaluation.pair_set}"
     places = {row.method: place for place, row in enumerate(evaluation.rows)}
-    charts = [*_distributions(evaluation, places), *_sweeps(Path(run_dir), places)]
-    return page(
-        title,
-        tag("header", tag("h1", title), tag("p", _best(evaluation))),
-        *(card(shown.title, *_table(shown)) for shown in tables(evaluation)),
-        grid(*charts),
-        grid(*_examples(evaluation)),
-        card(
-            "Command",
-            tag("pre", evaluation.command, css="wrap"),
-            tag(
-                "p",
-                f"Pairs with sha256 {evaluation.pairs_hash}; seed {evaluation.seed}; "
-                f"{evaluation.device}.",
-            ),
-        ),
+    return render(
+        "evaluation.html.jinja",
+        evaluation=evaluation,
+        best=_best(evaluation),
+        tables=tables(evaluation),
+        charts=[*_distributions(evaluation, places), *_sweeps(Path(run_dir), places)],
+        examples=_examples(evaluation),
     )
 
 
@@ -54,22 +43,16 @@ def _best(evaluation: Evaluation) -> str:
 
 
 def network_row(evaluation: Evaluation) -> Row | None:
-    """The first row of trained weights."""
+    """The first row of trained weights that has a motion."""
     for row in evaluation.rows:
-        if row.method.startswith("DBDNet") and "untrained" not in row.method:
+        if row.traits.learned and not row.traits.untrained and row.summary is not None:
             return row
     return None
 
 
-def _table(shown: Table) -> Iterator[Markup]:
-    heads = ["\n".join(filter(None, head)) for head in shown.heads]
-    yield table(heads, shown.body)
-    yield from (tag("p", note) for note in shown.notes)
-
-
-def _distributions(evaluation: Evaluation, places: dict[str, int]) -> Iterator[Markup]:
+def _distributions(evaluation: Evaluation, places: dict[str, int]) -> Iterator[Plot]:
     """For every method the share of pairs below each error."""
-    scored = [(row.method, row.errors) for row in evaluation.rows if row.errors is not None]
+    scored = [(row, row.errors) for row in evaluation.rows if row.errors is not None]
     if not scored:
         return
     for heading, field, axis, least in (
@@ -78,51 +61,59 @@ def _distributions(evaluation: Evaluation, places: dict[str, int]) -> Iterator[M
     ):
         text = "Share of the pairs whose error is below; higher and farther left is better."
         lines = [
-            _cumulative(name, places[name], getattr(errors, field), least)
-            for name, errors in scored
+            _cumulative(row, places[row.method], getattr(errors, field), least)
+            for row, errors in scored
         ]
         log = {"type": "log", "dtick": 1, "exponentformat": "none"}
         figure = figures.curves(lines, axis, "pairs, %", "lines", **log)
-        yield plot(heading, text, figure)
+        yield Plot(heading, text, figure)
 
 
-def _cumulative(name: str, place: int, errors: Float[np.ndarray, " p"], least: float) -> Curve:
+def _cumulative(row: Row, place: int, errors: Float[np.ndarray, " p"], least: float) -> Curve:
     errors = np.maximum(np.sort(errors), least)
     share = 100 * np.arange(1, len(errors) + 1) / len(errors)
-    return Curve(html.escape(name), place, errors.tolist(), share.tolist())
+    return Curve(row.method, place, errors.tolist(), share.tolist(), row.traits.learned)
 
 
-def _sweeps(run_dir: Path, places: dict[str, int]) -> Iterator[Markup]:
+def _sweeps(run_dir: Path, places: dict[str, int]) -> Iterator[Plot]:
     """A chart for each sweep that was saved."""
     for path in sorted(run_dir.glob("sweep_*.csv")):
         name = path.stem.removeprefix("sweep_")
         try:
             figure = figures.curves(*_read_sweep(path, name, places), mode="lines+markers")
         except (ValueError, KeyError, TypeError) as error:
-            yield card(f"Sweep: {name}", tag("p", f"{path.name} could not be read: {error!r}."))
+            yield Plot(f"Sweep: {name}", f"{path.name} could not be read: {error!r}.")
         else:
             text = "Mean rotation error as the pairs get harder or easier; lower is better."
-            yield plot(f"Sweep: {name}", text, figure)
+            yield Plot(f"Sweep: {name}", text, figure)
 
 
 def _read_sweep(path: Path, name: str, places: dict[str, int]) -> tuple[list[Curve], str, str]:
     """Curves and the words at the axes."""
     found: dict[str, list[tuple[float, float]]] = {}
+    learned = {}
     with path.open(newline="", encoding="utf-8") as file:
         for line in csv.DictReader(file):
             point = float(line["value"]), float(line["error_r"])
             found.setdefault(line["method"], []).append(point)
+            learned[line["method"]] = line.get("learned") == "1"
     if not found:
         raise ValueError("it holds no line")
     lines = [
-        Curve(html.escape(method), places.get(method, place), *zip(*points, strict=True))
+        Curve(
+            method,
+            places.get(method, place),
+            [x for x, _ in points],
+            [y for _, y in points],
+            learned=learned[method],
+        )
         for place, (method, points) in enumerate(found.items(), len(places))
     ]
-    label = SWEEPS[name].label if name in SWEEPS else html.escape(name)
+    label = SWEEPS[name].label if name in SWEEPS else name
     return lines, label, "error, degrees"
 
 
-def _examples(evaluation: Evaluation) -> Iterator[Markup]:
+def _examples(evaluation: Evaluation) -> Iterator[Plot]:
     """The network's best, median and worst pair, before and after."""
     row, pairs = network_row(evaluation), evaluation.test_pairs
     if row is None or pairs is None or row.errors is None or row.motions is None:
@@ -136,9 +127,9 @@ def _examples(evaluation: Evaluation) -> Iterator[Markup]:
         moved = source @ row.motions.rotation[i].T + row.motions.translation[i]
         error = row.errors.rotation_deg[i], row.errors.translation[i]
         text = f"{row.method}, pair {i}: off by {error[0]:.2f}° and {error[1]:.3f}."
-        yield plot(
+        yield Plot(
             f"{name} pair by rotation error, before",
             "As given.",
             figures.two_clouds(source, target),
         )
-        yield plot(f"{name} pair by rotation error, after", text, figures.two_clouds(moved, target))
+        yield Plot(f"{name} pair by rotation error, after", text, figures.two_clouds(moved, target))

@@ -1,6 +1,6 @@
 """Interactive figures: clouds in space, a histogram, and curves.
 
-A figure's text may hold simple HTML, so words from outside are escaped by whoever hands them over.
+A figure's text may hold simple HTML, so words from outside are escaped on their way into it.
 """
 
 from collections.abc import Sequence
@@ -29,12 +29,16 @@ BINS_WITHIN, BINS = 8, 40  # bars below the inlier distance, and in all
 
 
 class Curve(NamedTuple):
-    """One method's line of a chart; ``place`` is its number, which decides its look."""
+    """One method's line of a chart; ``place`` is its number, which decides its look.
+
+    A ``learned`` method's line is thick.
+    """
 
     name: str
     place: int
     x: Sequence[float]
     y: Sequence[float]
+    learned: bool = False
 
 
 def two_clouds(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"]) -> "Figure":
@@ -102,19 +106,23 @@ def residuals(drawn: DrawnPair, inlier_distance: float) -> "Figure":
 
 def curves(lines: Sequence[Curve], x: str, y: str, mode: str, **axis: Any) -> "Figure":
     """Lines over a common axis; ``mode`` is "lines" or "lines+markers", ``axis`` of the x axis."""
+    from markupsafe import escape
     from plotly.graph_objects import Figure, Scatter
 
     def look(line: Curve) -> dict[str, Any]:
         colour = CURVES[line.place % len(CURVES)]
-        if line.name.startswith("DBDNet"):
+        if line.learned:
             return {"color": colour, "width": 3}
         return {"color": colour, "width": 1.5, "dash": DASHES[line.place % len(DASHES)]}
 
     figure = Figure(
-        [Scatter(x=line.x, y=line.y, name=line.name, mode=mode, line=look(line)) for line in lines]
+        [
+            Scatter(x=line.x, y=line.y, name=str(escape(line.name)), mode=mode, line=look(line))
+            for line in lines
+        ]
     )
-    figure.update_xaxes(title_text=x, **axis)
-    figure.update_yaxes(title_text=y, rangemode="tozero")
+    figure.update_xaxes(title_text=str(escape(x)), **axis)
+    figure.update_yaxes(title_text=str(escape(y)), rangemode="tozero")
     return _flat(figure, legend=BELOW)
 
 

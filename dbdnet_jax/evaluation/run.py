@@ -1,9 +1,8 @@
 """Every method on the same test pairs, one pair at a time: errors and wall time."""
 
-import dataclasses
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -12,51 +11,42 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from tqdm import tqdm
 
-from dbdnet_jax.classical.open3d import (
-    fgr,
-    fgr_estimated,
-    icp,
-    icp_centred,
-    identity,
-)
-from dbdnet_jax.classical.refine import refine_multistart
 from dbdnet_jax.data.test_pairs import PairSet
 from dbdnet_jax.errors import MissingExtraError
+from dbdnet_jax.evaluation.methods import Method, Traits, Weights, make_methods, possible
 from dbdnet_jax.metrics.pose import (
+    Confusion,
     OverlapSummary,
     PairErrors,
     Summary,
     motion_errors,
     pair_confusion,
     point_distance,
-    registration_errors,
     summarise,
     summarise_overlap,
 )
 from dbdnet_jax.metrics.recall import ScanRecall, Scans, correspondence_rmse_m, scan_recall
-from dbdnet_jax.networks.dbdnet.register import register_clouds, register_given_overlap
-from dbdnet_jax.networks.params import Params, init_params
-from dbdnet_jax.types import Pair, Registration, Rigid
-
-TRUE_NORMALS = "FGR, true normals"
-Method = Callable[[Pair], Rigid | Registration]
+from dbdnet_jax.types import Answer, Pair, Rigid
 
 
 class Row(NamedTuple):
-    """One method's line of a table; without a summary, the note says why it could not run.
+    """One method's line of a table.
 
-    ``recall`` is there for pairs of scans only. ``errors``, ``motions`` and the `point_distance`
-    have a leading axis of pairs.
+    Without a summary the method gives no motion, without an overlap it predicts none; without
+    both, the note says why it could not run. ``recall`` is there for pairs of scans only.
+    ``errors``, ``motions`` and the `point_distance` have a leading axis of pairs.
     """
 
     method: str
-    summary: Summary | None
-    seconds_per_pair: float | None
+    summary: Summary | None = None
+    seconds_per_pair: float | None = None
     note: str = ""
     recall: ScanRecall | None = None
     errors: PairErrors | None = None
     motions: Rigid | None = None
     point_distance: Float[np.ndarray, " pairs"] | None = None
+    overlap: OverlapSummary | None = None
+    traits: Traits = Traits()
 
 
 class Evaluation(NamedTuple):
@@ -75,32 +65,29 @@ class Evaluation(NamedTuple):
 
 
 def evaluate(
-    params: Params, test: PairSet, *, seed: int, command: str, count: int | None = None
+    weights: Sequence[Weights], test: PairSet, *, seed: int, command: str, count: int | None = None
 ) -> Evaluation:
-    """Score the network, itself untrained (from ``seed``), and the baselines on test pairs.
+    """Score networks, the same untrained (from ``seed``), and the baselines on test pairs.
 
     ``count`` keeps the first pairs only, which the name then says (the hash stays that of the
     whole set); ``command`` is what to show as the way to get here.
 
     Raises:
-        ValueError: params without a registration network.
+        ValueError: params without the networks that their method needs.
     """
-    if params.registration is None:
-        raise ValueError(
-            "an evaluation needs a registration network; these params hold only the overlap "
-            "network. Train it too: python train.py --stage=registration"
-        )
     name, pairs, digest, scans, symmetric = test
     if count is not None and count < len(pairs.source.count):
         name = f"{name}_first_{count}"
         pairs = jax.tree.map(lambda leaf: leaf[:count], pairs)
         scans = scans and scans.first(count)
         symmetric = symmetric if symmetric is None else symmetric[:count]
-    methods = make_methods(params, seed)
-    if scans is not None:  # the lengths of `refine` are those of a shape in the unit sphere
-        methods.pop("DBDNet, refined", None)
+    methods = possible(
+        make_methods(weights, seed),
+        normals=bool(pairs.source_normals.any()),
+        unit_sphere=scans is None,
+    )
     return Evaluation(
-        rows=evaluate_methods(possible(methods, pairs), pairs, scans),
+        rows=evaluate_methods(methods, pairs, scans),
         constant_overlap=constant_overlap(pairs),
         pair_set=name,
         pairs=len(pairs.source.count),
@@ -113,86 +100,15 @@ def evaluate(
     )
 
 
-def make_methods(params: Params, seed: int) -> dict[str, Method]:
-    """The rows of the table by name; ``seed`` is that of the untrained weights.
+class _Scored(NamedTuple):
+    """What is kept of one answer; None for what the method does not say."""
 
-    Params without an overlap network are given the true overlap, and the name says so.
-    """
-    untrained = init_params(jax.random.key(seed), params.config)
-    network, name = from_network, "DBDNet"
-    if params.overlap is None:
-        network, name = from_true_overlap, "DBDNet, true overlap given"
-    methods = {
-        "identity": from_points(identity),
-        "ICP": from_points(icp),
-        "ICP, centroids first": from_points(icp_centred),
-        TRUE_NORMALS: from_normals(fgr),
-        "FGR, estimated normals": from_points(fgr_estimated),
-        f"{name} (untrained)": network(untrained),
-        name: network(params),
-    }
-    if params.overlap is not None:
-        methods["DBDNet, refined"] = from_refined_network(params)
-    return methods
+    errors: PairErrors | None
+    motion: Rigid | None
+    overlap: Confusion | None
 
 
-def possible(methods: Mapping[str, Method], pairs: Pair) -> dict[str, Method]:
-    """The methods without those that need normals, where the pairs, as of scans, have none."""
-    if pairs.source_normals.any():
-        return dict(methods)
-    return {name: method for name, method in methods.items() if name != TRUE_NORMALS}
-
-
-def from_points(baseline: Callable[..., Rigid]) -> Method:
-    """A baseline ``(source, target) -> Rigid`` as a method on pairs; padding is cut off."""
-
-    def method(pair: Pair) -> Rigid:
-        return baseline(
-            pair.source.points[: pair.source.count], pair.target.points[: pair.target.count]
-        )
-
-    return method
-
-
-def from_normals(baseline: Callable[..., Rigid]) -> Method:
-    """A baseline that also takes ``source_normals=, target_normals=`` as a method on pairs."""
-
-    def method(pair: Pair) -> Rigid:
-        rows, columns = slice(pair.source.count), slice(pair.target.count)
-        return baseline(
-            pair.source.points[rows],
-            pair.target.points[columns],
-            source_normals=pair.source_normals[rows],
-            target_normals=pair.target_normals[columns],
-        )
-
-    return method
-
-
-def from_network(params: Params) -> Method:
-    """The network as a method on pairs; compiled once per shape and model configuration."""
-    compiled = jax.jit(_register)
-    return lambda pair: compiled(params, pair)
-
-
-def from_refined_network(params: Params) -> Method:
-    """The network's pose after `refine_multistart`: no ground truth, no normals given."""
-    compiled = jax.jit(_register_and_refine)
-    return lambda pair: compiled(params, pair)
-
-
-def from_true_overlap(params: Params) -> Method:
-    """The registration network behind the true overlap labels: a bound, since it is told them.
-
-    It solves as often as `register` does. Its row has no overlap figures.
-    """
-    config = dataclasses.replace(params.config, iterations=params.config.solves)
-    params = Params(params.overlap, params.registration, config)
-    compiled = jax.jit(_register_given_labels)
-    return lambda pair: compiled(params, pair)
-
-
-def evaluate_method(name: str, method: Method, pairs: Pair, scans: Scans | None = None) -> Row:
+def evaluate_method(method: Method, pairs: Pair, scans: Scans | None = None) -> Row:
     """One method over stacked NumPy pairs (leading axis on every field).
 
     With ``scans``, those of the same pairs, the row has their registration recall too.
@@ -202,30 +118,33 @@ def evaluate_method(name: str, method: Method, pairs: Pair, scans: Scans | None 
     whose library is missing gives a row with a note instead of figures.
     """
     score = jax.jit(_score)
-    errors: list[PairErrors] = []
-    motions: list[Rigid] = []
+    scores: list[_Scored] = []
     seconds: list[float] = []
     rmse_m: list[float] = []
+    row = Row(method.name, traits=method.traits)
     try:
-        jax.block_until_ready(method(_pair(pairs, 0)))
+        jax.block_until_ready(method.answer(_pair(pairs, 0)))
         for i in range(len(pairs.source.count)):
             pair = _pair(pairs, i)
             start = time.perf_counter()
-            answer = jax.block_until_ready(method(pair))
+            answer = jax.block_until_ready(method.answer(pair))
             seconds.append(time.perf_counter() - start)
-            motions.append(Rigid(answer.rotation, answer.translation))
-            errors.append(jax.device_get(score(answer, pair)))
-            if scans is not None:
-                rmse_m.append(correspondence_rmse_m(answer, *scans.correspondences[i]))
+            scores.append(jax.device_get(score(answer, pair)))
+            if scans is not None and answer.motion is not None:
+                rmse_m.append(correspondence_rmse_m(answer.motion, *scans.correspondences[i]))
     except MissingExtraError as error:
-        return Row(name, None, None, str(error))
-    stacked, moved = (
-        jax.tree.map(lambda *leaves: np.stack(leaves), *found) for found in (errors, motions)
+        return row._replace(note=str(error))
+    errors, motions, overlap = jax.tree.map(lambda *leaves: np.stack(leaves), *scores)
+    row = row._replace(
+        seconds_per_pair=float(np.median(seconds)),
+        overlap=None if overlap is None else summarise_overlap(overlap),
     )
-    row = Row(name, summarise(stacked), float(np.median(seconds)), errors=stacked, motions=moved)
+    if errors is None:
+        return row
+    row = row._replace(summary=summarise(errors), errors=errors, motions=motions)
     if scans is None:
-        return row._replace(point_distance=np.asarray(_point_distances(moved, pairs)))
-    recall = scan_recall(stacked.rotation_deg, stacked.translation, np.array(rmse_m), scans)
+        return row._replace(point_distance=np.asarray(_point_distances(motions, pairs)))
+    recall = scan_recall(errors.rotation_deg, errors.translation, np.array(rmse_m), scans)
     return row._replace(recall=recall)
 
 
@@ -235,11 +154,11 @@ def _point_distances(motions: Rigid, pairs: Pair) -> Float[Array, " pairs"]:
 
 
 def evaluate_methods(
-    methods: Mapping[str, Method], pairs: Pair, scans: Scans | None = None
+    methods: Sequence[Method], pairs: Pair, scans: Scans | None = None
 ) -> list[Row]:
     """One row per method, in the given order, all on the same pairs; shows its progress."""
-    bar = tqdm(methods.items(), desc="evaluating", unit="method", leave=False, disable=None)
-    return [evaluate_method(name, method, pairs, scans) for name, method in bar]
+    bar = tqdm(methods, desc="evaluating", unit="method", leave=False, disable=None)
+    return [evaluate_method(method, pairs, scans) for method in bar]
 
 
 def constant_overlap(pairs: Pair) -> OverlapSummary:
@@ -254,23 +173,9 @@ def _pair(pairs: Pair, i: int) -> Pair:
     return jax.tree.map(lambda leaf: leaf[i], pairs)
 
 
-def _register(params: Params, pair: Pair) -> Registration:
-    return register_clouds(params, pair.source, pair.target)
-
-
-def _register_and_refine(params: Params, pair: Pair) -> Rigid:
-    answer = _register(params, pair)
-    motion = Rigid(answer.rotation, answer.translation)
-    return refine_multistart(pair.source, pair.target, motion).target_from_source
-
-
-def _register_given_labels(params: Params, pair: Pair) -> Rigid:
-    labels = (x.astype(jnp.float32) for x in (pair.source_overlap, pair.target_overlap))
-    answer = register_given_overlap(params, pair.source, pair.target, *labels)
-    return Rigid(answer.rotation, answer.translation)
-
-
-def _score(answer: Rigid | Registration, pair: Pair) -> PairErrors:
-    if isinstance(answer, Registration):
-        return registration_errors(answer, pair)
-    return motion_errors(answer, pair.target_from_source)
+def _score(answer: Answer, pair: Pair) -> _Scored:
+    motion, source, target = answer
+    errors = None if motion is None else motion_errors(motion, pair.target_from_source)
+    if source is None or target is None:
+        return _Scored(errors, motion, None)
+    return _Scored(errors, motion, pair_confusion(source, target, pair))

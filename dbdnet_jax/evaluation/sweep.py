@@ -3,7 +3,7 @@
 import csv
 import dataclasses
 import io
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,9 +12,9 @@ import jax
 from dbdnet_jax.data.config import DataConfig
 from dbdnet_jax.data.pairs import Protocol
 from dbdnet_jax.data.test_pairs import load_test_pairs
-from dbdnet_jax.evaluation.run import Row, evaluate_methods, make_methods, possible
+from dbdnet_jax.evaluation.methods import Weights, make_methods, possible
+from dbdnet_jax.evaluation.run import Row, evaluate_methods
 from dbdnet_jax.io.files import write_atomic
-from dbdnet_jax.networks.params import Params
 
 SWEEP_PAIRS = 60  # of each value, unless told otherwise
 NOISE_CLIP = 5.0  # standard deviations, as in the paper's protocol
@@ -70,13 +70,13 @@ def sweep(
     name: str,
     data: DataConfig,
     protocol: Protocol,
-    params: Params,
+    weights: Sequence[Weights],
     folder: str | Path,
     *,
     seed: int,
     count: int,
 ) -> Iterator[SweepPoint]:
-    """Score the network and the baselines on ``count`` test pairs for each value of a sweep.
+    """Score the networks and the baselines on ``count`` test pairs for each value of a sweep.
 
     The pairs are those of the data set, drawn anew under each protocol from the same seed, so that
     a pair keeps its shape from one value to the next; ``seed`` is that of untrained weights.
@@ -89,16 +89,18 @@ def sweep(
             "a sweep needs shapes, from which pairs are drawn; config.data.name is 'threedmatch'. "
             "Use configs/cad.py or configs/modelnet.py."
         )
-    methods = {
-        name: method
-        for name, method in make_methods(params, seed).items()
-        if name != "identity" and "untrained" not in name
-    }
+    methods = [
+        method
+        for method in make_methods(weights, seed)
+        if method.traits.moves and not (method.traits.untrained or method.traits.aligned)
+    ]
     for value in SWEEPS[name].values:
         changed = SWEEPS[name].change(protocol, value)
         pairs = load_test_pairs(data, changed, Path(folder) / "sweep").pairs
         pairs = jax.tree.map(lambda leaf: leaf[:count], pairs)
-        for row in evaluate_methods(possible(methods, pairs), pairs):
+        normals = bool(pairs.source_normals.any())
+        able = possible(methods, normals=normals, unit_sphere=True)
+        for row in evaluate_methods(able, pairs):
             yield SweepPoint(value, row)
 
 
@@ -110,7 +112,7 @@ def save_sweep(name: str, points: list[SweepPoint], run_dir: str | Path, command
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     head = ("vary", "value", "method", "error_r", "error_t", "median_r", "recall", "seconds")
-    writer.writerow([*head, "pairs", "command"])
+    writer.writerow([*head, "pairs", "command", "learned"])
     for value, row in points:
         if row.summary is not None:
             figures = (
@@ -128,6 +130,7 @@ def save_sweep(name: str, points: list[SweepPoint], run_dir: str | Path, command
                     *(f"{figure:.6g}" for figure in figures),
                     row.summary.pairs,
                     command,
+                    int(row.traits.learned),
                 ]
             )
     path = Path(run_dir) / f"sweep_{name}.csv"

@@ -125,11 +125,7 @@ def tables(evaluation: Evaluation) -> list[Table]:
         found.append(_of_columns("Registration recall", head, RECALL_COLUMNS, rows, notes))
     if evaluation.symmetric is not None:
         found.append(_by_symmetry(rows, np.asarray(evaluation.symmetric)))
-    predicted = [
-        (row.method, row.summary.overlap)
-        for row in rows
-        if row.summary is not None and row.summary.overlap is not None
-    ]
+    predicted = [(row.method, row.overlap) for row in rows if row.overlap is not None]
     if predicted:
         constant = evaluation.constant_overlap
         body = [
@@ -263,13 +259,12 @@ def _provenance_fields(evaluation: Evaluation) -> dict[str, Any]:
 
 def _flat(row: Row) -> dict[str, Any]:
     summary = dict.fromkeys(Summary._fields) if row.summary is None else row.summary._asdict()
-    overlap = summary.pop("overlap")
     recall = dict.fromkeys(ScanRecall._fields) if row.recall is None else row.recall._asdict()
     del summary["pairs"]  # the report's own figure
     return (
         {"method": row.method}
         | summary
-        | _flat_overlap(overlap)
+        | _flat_overlap(row.overlap)
         | recall
         | {"point_distance": _mean(row.point_distance)}
         | {"seconds_per_pair": row.seconds_per_pair, "note": row.note}
@@ -289,4 +284,4 @@ def _flat_overlap(overlap: OverlapSummary | None) -> dict[str, Any]:
 
 
 def _flat_constant(evaluation: Evaluation) -> dict[str, Any]:
-    return _flat(Row(CONSTANT_NAME, None, None)) | _flat_overlap(evaluation.constant_overlap)
+    return _flat(Row(CONSTANT_NAME)) | _flat_overlap(evaluation.constant_overlap)

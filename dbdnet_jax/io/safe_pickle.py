@@ -12,12 +12,14 @@ import io
 import math
 import mmap
 import pickle
-import pickletools
 import re
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from dbdnet_jax.errors import CheckpointError
+from dbdnet_jax.io.pickle_bounds import MOST_OPCODES, MOST_OPCODES_OF_TENSORS, check_pickle
 
 _STORAGES = {
     "DoubleStorage": "f8",
@@ -32,10 +34,6 @@ _STORAGES = {
 }
 _PLAIN_DTYPE = re.compile(r"b1|[iu][1248]|f[248]|c8|c16|[SU]\d{1,6}")
 _MAX_DIMENSIONS = 32
-
-
-class CheckpointError(ValueError):
-    """A file that cannot be read: refused, damaged, or not what its reader expects."""
 
 
 class Storage(NamedTuple):
@@ -193,14 +191,7 @@ def unpickle(
     """
     stream: Any = data if isinstance(data, mmap.mmap) else io.BytesIO(data)
     stream.seek(start)
-    for number, (opcode, argument, _) in enumerate(pickletools.genops(stream)):
-        # Extension codes get round find_class, and the C unpickler allocates its memo up to the
-        # largest slot named.
-        far = "PUT" in opcode.name and int(argument or 0) > number
-        if far or opcode.name.startswith("EXT"):
-            raise CheckpointError(
-                f"pickle does not write {opcode.name} {argument} here. Do not trust the file."
-            )
+    check_pickle(stream, MOST_OPCODES_OF_TENSORS if tensors else MOST_OPCODES)
     end = stream.tell()
     reader = _Reader(bytes(data[start:end]), tensors)
     return reader.load(), end, reader.storages

@@ -17,10 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from dbdnet_jax.io.safe_pickle import CheckpointError, finish, unpickle
+from dbdnet_jax.errors import CheckpointError
+from dbdnet_jax.io.safe_pickle import finish, unpickle
 
 _STREAM_MAGIC = 0x1950A86A20F9469CFC6C
 _STREAM_VERSION = 1001
+_MOST_RECORDS = 20_000  # of an archive: reading its directory takes time for each
 
 
 def load_torch(path: str | Path) -> Any:
@@ -75,6 +77,13 @@ def _guarded(path: str | Path, read: Callable[[], Any]) -> Any:
 
 
 def _read_zip(path: str | Path, data: mmap.mmap) -> Any:
+    end = data.rfind(b"PK\x05\x06", max(0, len(data) - 65_557))  # before any listing is made of it
+    (count,) = struct.unpack_from("<H", data, end + 10) if 0 <= end < len(data) - 12 else (0,)
+    if _MOST_RECORDS < count:
+        raise CheckpointError(
+            f"A torch archive must have at most {_MOST_RECORDS} records; this one has {count} or "
+            "more. Save fewer tensors."
+        )
     with zipfile.ZipFile(path) as archive:
         records = {info.filename: info for info in archive.infolist()}
     roots = [name.removesuffix("data.pkl") for name in records if name.endswith("/data.pkl")]

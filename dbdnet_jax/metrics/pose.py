@@ -18,15 +18,14 @@ from jaxtyping import Array, Bool, Float, Int
 from dbdnet_jax.ops import rigid
 from dbdnet_jax.ops.grouping import squared_distances
 from dbdnet_jax.ops.rigid import HIGHEST
-from dbdnet_jax.ops.sampling import prefix_mask
-from dbdnet_jax.types import Pair, Registration, Rigid
+from dbdnet_jax.types import Pair, Rigid
 
 GIMBAL_COSINE = 1e-6  # below: x and z turn about one axis; float32 cannot tell them apart
 OVERLAP_THRESHOLD = 0.5
 
 
 class Confusion(NamedTuple):
-    """Points by predicted and true overlap; all zero for a method that predicts none."""
+    """Points by predicted and true overlap."""
 
     true_positive: Int[Array, "*pairs"]
     false_positive: Int[Array, "*pairs"]
@@ -42,7 +41,6 @@ class PairErrors(NamedTuple):
     euler_difference_deg: Float[Array, "*pairs 3"]
     translation_difference: Float[Array, "*pairs 3"]
     finite: Bool[Array, "*pairs"]
-    overlap: Confusion
 
 
 class OverlapSummary(NamedTuple):
@@ -59,7 +57,6 @@ class Summary(NamedTuple):
 
     RMSE and MAE go over all pairs and all three components: Euler angles "xyz" (extrinsic) for
     the rotation. ``error_*`` and ``median_*`` are over pairs, of the isotropic errors.
-    ``overlap`` is None for a method that predicts none.
     """
 
     pairs: int
@@ -74,7 +71,6 @@ class Summary(NamedTuple):
     median_translation: float
     recall_5deg_0p1: float
     recall_15deg_0p3: float
-    overlap: OverlapSummary | None
 
 
 def rotation_error_deg(
@@ -135,20 +131,19 @@ def overlap_confusion(
 
 
 def motion_errors(predicted: Rigid, truth: Rigid) -> PairErrors:
-    """Errors of a predicted motion of one pair; the overlap counts are zero.
+    """Errors of a predicted motion of one pair.
 
+    An answer that says ``valid=False`` is scored as the identity it holds.
     Euler differences are plain differences of the angles, not wrapped, as in the paper.
     """
     scored, finite = _scored(predicted, truth)
     euler = jnp.abs(euler_xyz_deg(scored.rotation) - euler_xyz_deg(truth.rotation))
-    zero = jnp.zeros((), jnp.int32)
     return PairErrors(
         rotation_deg=jnp.where(finite, rotation_error_deg(scored.rotation, truth.rotation), 180.0),
         translation=translation_error(scored, truth),
         euler_difference_deg=jnp.where(finite, euler, 180.0),
         translation_difference=jnp.abs(scored.translation - truth.translation),
         finite=finite,
-        overlap=Confusion(zero, zero, zero, zero),
     )
 
 
@@ -159,9 +154,7 @@ def point_distance(predicted: Rigid, pair: Pair) -> Float[Array, ""]:
     of the shape is forgiven. Noise, and how far apart the points are, keep it above zero.
     """
     scored, _ = _scored(predicted, pair.target_from_source)
-    rows, columns = (
-        prefix_mask(cloud.points.shape[0], cloud.count) for cloud in (pair.source, pair.target)
-    )
+    rows, columns = pair.source.valid, pair.target.valid
     source = jnp.where(rows[:, None], pair.source.points, 0.0)
     moved, true = rigid.apply(scored, source), rigid.apply(pair.target_from_source, source)
     nearest = jnp.minimum(
@@ -185,26 +178,21 @@ def pair_confusion(
     source_probability: Float[Array, " n"], target_probability: Float[Array, " m"], pair: Pair
 ) -> Confusion:
     """Overlap counts over the valid points of both clouds of one pair."""
-    source = overlap_confusion(
-        source_probability,
-        pair.source_overlap,
-        prefix_mask(pair.source_overlap.shape[0], pair.source.count),
-    )
-    target = overlap_confusion(
-        target_probability,
-        pair.target_overlap,
-        prefix_mask(pair.target_overlap.shape[0], pair.target.count),
-    )
+    source = overlap_confusion(source_probability, pair.source_overlap, pair.source.valid)
+    target = overlap_confusion(target_probability, pair.target_overlap, pair.target.valid)
     return Confusion(*(s + t for s, t in zip(source, target, strict=True)))
 
 
-def registration_errors(answer: Registration, pair: Pair) -> PairErrors:
-    """Errors of the network's answer for one pair: its motion and its overlap probabilities.
+def overlap_error(counts: Confusion) -> Float[Array, ""]:
+    """The share of points of the wrong class."""
+    wrong = counts.false_positive + counts.false_negative
+    return wrong / (wrong + counts.true_positive + counts.true_negative)
 
-    An answer that says ``valid=False`` is scored as the identity it holds.
-    """
-    motion = motion_errors(Rigid(answer.rotation, answer.translation), pair.target_from_source)
-    return motion._replace(overlap=pair_confusion(answer.src_overlap, answer.tgt_overlap, pair))
+
+def overlap_f1(counts: Confusion) -> Float[Array, ""]:
+    """``2 TP / (2 TP + FP + FN)``; 0 where nothing is or is said to be overlapping."""
+    wrong = counts.false_positive + counts.false_negative
+    return 2 * counts.true_positive / jnp.maximum(2 * counts.true_positive + wrong, 1)
 
 
 def summarise_overlap(counts: Confusion) -> OverlapSummary | None:
@@ -259,5 +247,4 @@ def summarise(errors: PairErrors) -> Summary:
         median_translation=float(np.median(translation)),
         recall_5deg_0p1=float(np.mean((rotation < 5) & (translation < 0.1))),
         recall_15deg_0p3=float(np.mean((rotation < 15) & (translation < 0.3))),
-        overlap=summarise_overlap(errors.overlap),
     )

@@ -1,7 +1,9 @@
 """The small layers: affine maps, masked group norm, moves between levels, attention blocks.
 
 Every layer works on one cloud of static size whose valid rows are given by a mask. Parameters are
-cast to the features' type, so a network given float64 computes in float64 throughout.
+cast to the features' type, so a network given float64 computes in float64 throughout. Beside each
+layer stand the shapes of its parameters by name: tracing the full-size network to find them takes
+seconds, loading weights should not. A test holds the lists against the networks.
 """
 
 import operator
@@ -12,8 +14,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from dbdnet_jax.networks.params import Shapes
 from dbdnet_jax.ops.attention import attention
 from dbdnet_jax.ops.grouping import interpolate, max_over_neighbours
+
+Layers = tuple[tuple[int, int], ...]  # (features, groups of the norm) of each layer
 
 NORM_EPSILON = 1e-5  # torch's default, which the released weights were trained with
 LEAKY_SLOPE = 0.2
@@ -22,7 +27,7 @@ LEAKY_SLOPE = 0.2
 class Affine(nn.Module):
     """Kernel (in, out) and bias (out,) of an affine map, for layers that apply them in pieces.
 
-    Declared as zeros: `params.init_params` draws the values of the whole network at once.
+    Declared as zeros: `initial.init_params` draws the values of the whole network at once.
     """
 
     features: int
@@ -35,6 +40,11 @@ class Affine(nn.Module):
         kernel = self.param("kernel", nn.initializers.zeros, (fan_in, self.features))
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
         return kernel.astype(dtype), bias.astype(dtype)
+
+
+def affine_shapes(name: str, fan_in: int, features: int) -> Shapes:
+    """The parameters of an `Affine`."""
+    return {f"{name}/kernel": (fan_in, features), f"{name}/bias": (features,)}
 
 
 def dense(affine: Affine, x: Float[Array, "n c"]) -> Float[Array, "n d"]:
@@ -71,6 +81,11 @@ class Norm(nn.Module):
         return slope, bias - slope * jnp.broadcast_to(centre, mean.shape).reshape(-1)
 
 
+def norm_shapes(name: str, features: int) -> Shapes:
+    """The parameters of a `Norm`, or of a layer norm."""
+    return {f"{name}/scale": (features,), f"{name}/bias": (features,)}
+
+
 class DenseNorm(nn.Module):
     """Dense, group normalisation over the valid rows, ReLU.
 
@@ -90,6 +105,16 @@ class DenseNorm(nn.Module):
         norm = Norm(self.features, self.groups, name="norm")
         slope, offset = norm(mean, weight @ (centred * centred))
         return nn.relu(x * slope[None, :] + offset[None, :])
+
+
+def dense_norm_shapes(stem: str, fan_in: int, layers: Layers) -> Shapes:
+    """The parameters of `DenseNorm` layers one after another, named STEM_0, STEM_1 and so on."""
+    shapes: Shapes = {}
+    for layer, (features, _) in enumerate(layers):
+        shapes |= affine_shapes(f"{stem}_{layer}/conv", fan_in, features)
+        shapes |= norm_shapes(f"{stem}_{layer}/norm", features)
+        fan_in = features
+    return shapes
 
 
 class Exchange(nn.Module):
@@ -121,6 +146,11 @@ class Exchange(nn.Module):
         The weights sum to one, so the affine map may run first, on the fewer coarse rows.
         """
         return nn.relu(interpolate(dense(self.conv, x), index, weight))
+
+
+def exchange_shapes(name: str, fan_in: int, features: int) -> Shapes:
+    """The parameters of an `Exchange`."""
+    return affine_shapes(f"{name}/conv", fan_in, features)
 
 
 class MultiHeadAttention(nn.Module):
@@ -181,6 +211,18 @@ class AttentionBlock(nn.Module):
                 dropout_key, keys = split[0], split[1:]
             features = norm(features + over_clouds(attend, features, memory, memory_valid, keys))
         return features
+
+
+def attention_shapes(stem: str, blocks: int, width: int) -> Shapes:
+    """The parameters of `AttentionBlock` layers one after another, named STEM_0 and so on."""
+    shapes: Shapes = {}
+    for block in range(blocks):
+        for step in ("self", "cross"):
+            attend = f"{stem}_{block}/{step}_attention"
+            shapes |= affine_shapes(f"{attend}/in_proj", width, 3 * width)
+            shapes |= affine_shapes(f"{attend}/out_proj", width, width)
+            shapes |= norm_shapes(f"{stem}_{block}/{step}_layer_norm", width)
+    return shapes
 
 
 def over_clouds(module: nn.Module, *stacked: Any) -> Array:

@@ -19,7 +19,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from dbdnet_jax.networks.blocks import LEAKY_SLOPE, Affine, Norm
+from dbdnet_jax.networks.blocks import LEAKY_SLOPE, Affine, Norm, affine_shapes, norm_shapes
+from dbdnet_jax.networks.params import Shapes
 from dbdnet_jax.ops.grouping import max_over_slots
 
 BLOCK_VALUES = 1 << 17  # of one block's edges, k x rows x channels: 512 KB of float32
@@ -50,6 +51,16 @@ class EdgeConv(nn.Module):
         best, mean, variance = edge_extremes(near, own, kernel, bias, rising, index, valid)
         slope, offset = norm(mean, variance)
         return nn.leaky_relu(best * slope[None, :] + offset[None, :], LEAKY_SLOPE)
+
+
+def edgeconv_shapes(name: str, fan_in: int, features: int) -> Shapes:
+    """The parameters of an `EdgeConv` on features of width ``fan_in``."""
+    return {
+        **affine_shapes(f"{name}/conv_0", 2 * fan_in, features),
+        **norm_shapes(f"{name}/norm_0", features),
+        **affine_shapes(f"{name}/conv_1", features, features),
+        **norm_shapes(f"{name}/norm_1", features),
+    }
 
 
 def edge_moments(

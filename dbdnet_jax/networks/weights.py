@@ -6,31 +6,30 @@ import dataclasses
 import hashlib
 import io
 import json
+import math
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.io.files import write_atomic
-from dbdnet_jax.io.safe_pickle import CheckpointError
-from dbdnet_jax.networks.dbdnet.config import ModelConfig
-from dbdnet_jax.networks.dbdnet.register import Params
-from dbdnet_jax.networks.dbdnet.released import from_released, to_released
-from dbdnet_jax.networks.params import flatten, parameter_shapes, require_shapes, unflatten
-
-__all__ = [
-    "CheckpointError",
-    "from_released",
-    "load_metadata",
-    "load_params",
-    "load_pretrained",
-    "save_params",
-    "to_released",
-]
+from dbdnet_jax.io.forks import require_own_jax
+from dbdnet_jax.networks.params import (
+    Params,
+    flatten,
+    require_finite,
+    require_shapes,
+    unflatten,
+)
+from dbdnet_jax.networks.table import DEFAULT_METHOD, LEARNED, method_of, parameter_shapes
 
 PRETRAINED = Path(__file__).parent / "pretrained"
 _FORMAT = 1
+_WIDEST = 65_536  # features of a layer; the widest known have 1,024
+_MOST_MEMBERS = 20_000  # the largest network that a configuration may ask for has 6,000
 _HEADER, _CHECKSUM = "header", "sha256"
 
 
@@ -43,23 +42,25 @@ def save_params(
 
     Args:
       path: the file; its folder must exist. An existing file is replaced.
-      params: the parameters; a network that is None is left out.
+      params: the parameters of any method, all of its networks or some.
       metadata: anything JSON can hold, for people: origin, data, figures.
 
     Raises:
-      CheckpointError: the arrays do not fit the configuration, or are no floating-point numbers.
+      CheckpointError: the arrays do not fit the configuration, or are no finite floating-point
+        numbers: such a file could not be loaded.
       OSError: the folder is missing, not writable, or full.
     """
     arrays = flatten(params)
     _check(arrays, params.config, "params")
-    header = json.dumps(
-        {
-            "format": _FORMAT,
-            "model": dataclasses.asdict(params.config),
-            "metadata": dict(metadata or {}),
-        },
-        sort_keys=True,
-    )
+    content = {
+        "format": _FORMAT,
+        "model": dataclasses.asdict(params.config),
+        "metadata": dict(metadata or {}),
+    }
+    method = method_of(params.config)
+    if method != DEFAULT_METHOD:
+        content["method"] = method
+    header = json.dumps(content, sort_keys=True)
     path = Path(path)
     if not path.parent.is_dir():
         raise FileNotFoundError(
@@ -76,28 +77,49 @@ def load_params(path: str | Path) -> Params:
 
     Raises:
       CheckpointError: the file is truncated or altered, has a field or version this release does
-        not know, or arrays that do not fit its configuration.
+        not know, a configuration out of bounds, or arrays that do not fit it or are not finite.
       OSError: the file cannot be opened.
+      RuntimeError: the process was forked after JAX was used.
     """
+    require_own_jax("load_params")
     header, arrays = _read(path)
-    fields = {field.name for field in dataclasses.fields(ModelConfig)}
-    unknown = sorted(set(header["model"]) - fields)
+    method = header.get("method", DEFAULT_METHOD)
+    config = read_model(method, header["model"], str(path))
+    _check(arrays, config, str(path))
+    native = {name: x.astype(x.dtype.newbyteorder("="), copy=False) for name, x in arrays.items()}
+    return unflatten(native, config)
+
+
+def read_model(method: str, fields: Mapping[str, Any], owner: str) -> Any:
+    """The configuration of a method's network from its fields, as JSON holds them.
+
+    Raises:
+      CheckpointError: a method or a field that this release does not know, or a value it refuses.
+    """
+    if not isinstance(method, str) or method not in LEARNED:
+        raise CheckpointError(
+            f"{owner}: the method must be one of {', '.join(LEARNED)}; got {method!r}. Update "
+            "dbdnet_jax: a newer release wrote the file."
+        )
+    record = LEARNED[method].config
+    unknown = sorted(set(fields) - {field.name for field in dataclasses.fields(record)})
     if unknown:
         raise CheckpointError(
-            f"{path}: every field of the configuration must be known; {', '.join(unknown)} "
+            f"{owner}: every field of the configuration must be known; {', '.join(unknown)} "
             "is not. Update dbdnet_jax: a newer release wrote the file."
         )
+    for name, value in fields.items():
+        for width in value if isinstance(value, list) else ():
+            if type(width) is not int or not 1 <= width <= _WIDEST:
+                raise CheckpointError(
+                    f"{owner}: the configuration cannot be built: {name} must hold whole numbers "
+                    f"from 1 to {_WIDEST}; got {width!r:.60}. Save it again with save_params."
+                )
     try:
-        config = ModelConfig(**header["model"])
-    except (TypeError, ValueError) as error:
-        raise CheckpointError(f"{path}: the configuration cannot be built: {error}") from error
-    _check(arrays, config, str(path))
-    return unflatten(arrays, config)
-
-
-def load_metadata(path: str | Path) -> dict[str, Any]:
-    """The free-form metadata of a file of weights; errors as in ``load_params``."""
-    return _read(path)[0]["metadata"]
+        # JSON has no tuples; a configuration must be hashable.
+        return record(**{k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()})
+    except (TypeError, ValueError, ArithmeticError) as error:
+        raise CheckpointError(f"{owner}: the configuration cannot be built: {error}") from error
 
 
 def load_pretrained(name: str = "cad") -> Params:
@@ -145,31 +167,81 @@ def _checksum(header: str, arrays: Mapping[str, np.ndarray]) -> str:
 
 def _read(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays of a file, its checksum verified."""
-    with open(path, "rb") as file:
-        try:
-            with np.load(file, allow_pickle=False) as archive:
-                arrays = {name: archive[name] for name in archive.files}
-            text, checksum = (str(arrays.pop(name)[()]) for name in (_HEADER, _CHECKSUM))
-        except Exception as error:  # NumPy and zipfile answer damage with a dozen types of error
-            raise CheckpointError(
-                f"{path}: the file is truncated, damaged or was not written by save_params "
-                f"({type(error).__name__}: {error}). Fetch it or save it again; a PyTorch "
-                "checkpoint is read by from_released."
-            ) from error
+    try:
+        with open(path, "rb") as file:
+            arrays = _members(file)
+        text, checksum = (str(arrays.pop(name)[()]) for name in (_HEADER, _CHECKSUM))
+    except OSError:
+        raise
+    except Exception as error:  # NumPy and zipfile answer damage with a dozen types of error
+        raise CheckpointError(
+            f"{path}: the file is truncated, damaged or was not written by save_params "
+            f"({type(error).__name__}: {error}). Fetch it or save it again; a PyTorch "
+            "checkpoint is read by from_released."
+        ) from error
     if _checksum(text, arrays) != checksum:
         raise CheckpointError(
             f"{path}: the content must hash to the sha256 it was saved with, {checksum[:12]}...; "
             "it was altered or damaged. Fetch it or save it again."
         )
-    header = json.loads(text)
-    if header["format"] != _FORMAT:
+    return _header(text, str(path)), arrays
+
+
+def _members(file: Any) -> dict[str, np.ndarray]:
+    """The arrays of an archive as `numpy.savez` writes it: stored, none larger than its bytes.
+
+    `numpy.load` would believe what the archive and its arrays say of their sizes, and a file of a
+    few megabytes may unpack to any number of gigabytes.
+    """
+    size = file.seek(0, io.SEEK_END)
+    arrays = {}
+    with zipfile.ZipFile(file) as archive:
+        members = archive.infolist()
+        stored = all(member.compress_type == zipfile.ZIP_STORED for member in members)
+        if not stored or sum(member.file_size for member in members) > size:
+            raise ValueError("its arrays must be stored uncompressed, as save_params does")
+        if len(members) > _MOST_MEMBERS:
+            raise ValueError(f"it must hold at most {_MOST_MEMBERS} arrays; got {len(members)}")
+        for member in members:
+            with archive.open(member) as stream:
+                arrays[member.filename.removesuffix(".npy")] = _array(stream, member.file_size)
+    return arrays
+
+
+def _array(stream: Any, size: int) -> np.ndarray:
+    """One array of numbers or text in NumPy's format, which must fill ``size`` bytes exactly."""
+    version = np.lib.format.read_magic(stream)
+    read_head = {(1, 0): "read_array_header_1_0", (2, 0): "read_array_header_2_0"}[version]
+    shape, fortran, dtype = getattr(np.lib.format, read_head)(stream)
+    data = stream.read(size)
+    if dtype.kind not in "fiubU" or math.prod(shape) * dtype.itemsize != len(data):
+        raise ValueError(f"an array of {dtype} {shape} does not fill {len(data)} bytes")
+    return np.ndarray(shape, dtype, data, order="F" if fortran else "C")
+
+
+def _header(text: str, path: str) -> dict[str, Any]:
+    """The header's fields, their types checked: a checksum says nothing about sense."""
+    try:
+        header = json.loads(text)
+    except (ValueError, RecursionError) as error:
         raise CheckpointError(
-            f"{path}: the format must be {_FORMAT}; got {header['format']!r}. Update dbdnet_jax."
+            f"{path}: the header must be JSON; {error}. Fetch it or save it again."
+        ) from error
+    if not isinstance(header, dict) or header.get("format") != _FORMAT:
+        got = header.get("format") if isinstance(header, dict) else header
+        raise CheckpointError(
+            f"{path}: the format must be {_FORMAT}; got {got!r:.60}. Update dbdnet_jax."
         )
-    return header, arrays
+    for name in ("model", "metadata"):
+        if not isinstance(header.get(name), dict):
+            raise CheckpointError(
+                f"{path}: the header must hold an object named {name!r}; got "
+                f"{header.get(name)!r:.60}. Save it again with save_params."
+            )
+    return header
 
 
-def _check(arrays: Mapping[str, np.ndarray], config: ModelConfig, owner: str) -> None:
+def _check(arrays: Mapping[str, np.ndarray], config: Any, owner: str) -> None:
     """Refuse arrays that are not the parameters of the networks they name."""
     expected = parameter_shapes(config, {name.split("/")[0] for name in arrays})
     require_shapes(
@@ -178,9 +250,14 @@ def _check(arrays: Mapping[str, np.ndarray], config: ModelConfig, owner: str) ->
         owner,
         "Do configuration and arrays come from the same training?",
     )
-    wrong = [f"{name} ({array.dtype})" for name, array in arrays.items() if array.dtype.kind != "f"]
+    wrong = [
+        f"{name} ({array.dtype})"
+        for name, array in arrays.items()
+        if array.dtype.kind != "f" or array.dtype.itemsize > 8
+    ]
     if wrong or not arrays:
         raise CheckpointError(
             f"{owner} must hold float16, float32 or float64 parameters; got "
             f"{', '.join(wrong) or 'no array'}. Convert them first."
         )
+    require_finite(arrays, owner)

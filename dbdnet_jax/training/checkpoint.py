@@ -1,7 +1,8 @@
 """Checkpoints of a training run: the newest two and the best one, each written as a whole.
 
-A run folder holds one folder for each stage (``overlap``, ``registration`` and perhaps ``joint``);
-in it ``stage.json`` says what the stage trains, and ``checkpoints/STEP`` holds a state at a step.
+A run folder holds one folder for each stage, named as the network it trains (``joint``: all of
+them, further); in it ``stage.json`` says what the stage trains, of which method, and
+``checkpoints/STEP`` holds a state at a step.
 Weights to share are another matter: see `dbdnet_jax.networks.weights`.
 """
 
@@ -16,13 +17,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.io.files import write_atomic
-from dbdnet_jax.io.safe_pickle import CheckpointError
-from dbdnet_jax.networks.dbdnet.config import ModelConfig
-from dbdnet_jax.networks.params import NETWORKS, Params
+from dbdnet_jax.networks.batch_norm import join_batch_stats
+from dbdnet_jax.networks.params import Params
+from dbdnet_jax.networks.table import DEFAULT_METHOD, LEARNED
+from dbdnet_jax.networks.weights import read_model
 
-STAGES = NETWORKS  # each is named as the network it trains
-JOINT = "joint"  # both networks, further
+JOINT = "joint"  # all networks of a method, further
 KEPT = 2  # newest checkpoints; the second survives when the first is damaged
 
 State = TypeVar("State")
@@ -97,9 +99,14 @@ class Checkpoints:
         return jax.tree.map(jnp.asarray, self._read(step, like))
 
     def restore_weights(self, step: int) -> Any:
-        """The weights of ``step`` to use: their moving average where one was kept."""
+        """The weights of ``step`` to use: their moving average where one was kept.
+
+        With them the running averages of batch norms, where there are any.
+        """
         state = self._read(step, None)
         weights = state["params"] if state.get("ema") is None else state["ema"]
+        if state.get("batch_stats") is not None:
+            weights = join_batch_stats(weights, state["batch_stats"])
         return jax.tree.map(jnp.asarray, weights)
 
     def _read(self, step: int, like: Any) -> Any:
@@ -120,8 +127,12 @@ class Checkpoints:
         return state
 
 
-def write_stage(folder: Path, record: dict[str, Any]) -> None:
+def write_stage(
+    folder: Path, record: dict[str, Any], defaults: dict[str, Any] | None = None
+) -> None:
     """Put ``stage.json`` into a stage's folder, or check that the one there says the same.
+
+    What an older release did not write is taken from ``defaults``, a part of a record.
 
     Raises:
         CheckpointError: the folder is of another configuration; names the first field that differs.
@@ -132,8 +143,9 @@ def write_stage(folder: Path, record: dict[str, Any]) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         write_atomic(path, (json.dumps(record, indent=1) + "\n").encode())
         return
-    found = _flatten(read_stage(folder))
-    wanted = _flatten(record)
+    wanted, known = _flatten(record), _flatten(json.loads(json.dumps(defaults or {})))
+    found = {name: known[name] for name in known if name in wanted}
+    found |= _flatten(read_stage(folder))
     for name in sorted(found.keys() | wanted.keys()):
         if found.get(name) != wanted.get(name):
             raise CheckpointError(
@@ -168,9 +180,11 @@ def load_best(run_dir: str | Path, *, joint: bool = True) -> Params:
     Raises:
         CheckpointError: no stage has a validated checkpoint, or one is damaged.
     """
-    weights: dict[str, Any] = dict.fromkeys(STAGES)
+    networks: dict[str, Any] = {}
     model = None
-    for stage in (*STAGES, JOINT) if joint else STAGES:
+    method = _method(Path(run_dir))
+    parts = LEARNED[method].parts
+    for stage in (*parts, JOINT) if joint else parts:
         folder = Path(run_dir) / stage
         if not (folder / "checkpoints").is_dir():
             continue
@@ -178,24 +192,45 @@ def load_best(run_dir: str | Path, *, joint: bool = True) -> Params:
             step = checkpoints.best_step()
             if step is not None:
                 found = checkpoints.restore_weights(step)
-                weights |= found if stage == JOINT else {stage: found}
-                model = _model_config(folder)
+                networks |= found if stage == JOINT else {stage: found}
+                model = _model_config(folder, method)
     if model is None:
         raise CheckpointError(
             f"a run folder must hold a validated checkpoint; {run_dir} has none. Train first: "
             "python train.py --config=configs/NAME.py --run_dir=..."
         )
-    return Params(**weights, config=model)
+    return Params(networks, model)
 
 
-def _model_config(folder: Path) -> ModelConfig:
-    try:
-        return ModelConfig(**read_stage(folder)["model"])
-    except (KeyError, TypeError, ValueError) as error:
+def was_trained(run_dir: str | Path) -> bool:
+    """Whether a folder holds checkpoints of any stage."""
+    return any(Path(run_dir).glob("*/checkpoints"))
+
+
+def _method(run_dir: Path) -> str:
+    """The method that a run's stages train; that of every stage must be the same."""
+    found = {
+        path.parent.name: read_stage(path.parent).get("method", DEFAULT_METHOD)
+        for path in sorted(run_dir.glob("*/stage.json"))
+    }
+    methods = set(found.values()) or {DEFAULT_METHOD}
+    if len(methods) > 1 or not methods <= LEARNED.keys():
         raise CheckpointError(
-            f"'model' in {folder / 'stage.json'} must be the fields of ModelConfig "
-            f"({_first_line(error)}). Use the "
-            "version of dbdnet_jax that trained it, or train again."
+            f"all stages of a run must train one method out of {', '.join(LEARNED)}; those in "
+            f"{run_dir} are of {found}. Give each method a --run_dir of its own, or use the "
+            "version of dbdnet_jax that trained it."
+        )
+    return methods.pop()
+
+
+def _model_config(folder: Path, method: str) -> Any:
+    try:
+        return read_model(method, read_stage(folder)["model"], str(folder / "stage.json"))
+    except (KeyError, TypeError, CheckpointError) as error:
+        raise CheckpointError(
+            f"'model' in {folder / 'stage.json'} must be the fields of "
+            f"{LEARNED[method].config.__name__} ({_first_line(error)}). Use the version of "
+            "dbdnet_jax that trained it, or train again."
         ) from error
 
 

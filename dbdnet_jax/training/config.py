@@ -1,4 +1,7 @@
-"""A configuration as records: what `configs/*.py` says, checked once, before anything starts."""
+"""A configuration as records: what `configs/*.py` says, checked once, before anything starts.
+
+Every field has its default in its record; a configuration states the differences.
+"""
 
 from __future__ import annotations
 
@@ -13,170 +16,150 @@ from ml_collections import ConfigDict
 
 from dbdnet_jax.data.config import DataConfig
 from dbdnet_jax.data.pairs import Protocol
-from dbdnet_jax.networks.dbdnet.config import ModelConfig
-from dbdnet_jax.training.losses import LossWeights
+from dbdnet_jax.networks.table import DEFAULT_METHOD, LEARNED
+from dbdnet_jax.training.table import STAGES
+from dbdnet_jax.training.task import RunConfig, TrainConfig
 
-MASKS = ("predicted", "truth", "perturbed")
+LARGEST = 1e15  # of any number: whole numbers below it are exact as floats, and no count is larger
 
 
-@dataclasses.dataclass(frozen=True)
-class TrainConfig:
-    """What all stages share; cadences are in steps, 0 switches clipping and the average off.
+def default_config(method: str = DEFAULT_METHOD) -> ConfigDict:
+    """Every field there is for a method, at its default; locked, so that a typo is an error.
 
-    ``start`` is a file of weights that the networks in it start from ("": fresh ones).
-    ``batch_size`` and ``learning_rate`` are what the stages' own fields follow until set.
+    The batch size and learning rate of DBDNet's stages follow those of ``config.train`` until set.
+    A method of a single stage takes its own from ``config.STAGE``.
     """
-
-    seed: int
-    start: str
-    batch_size: int
-    learning_rate: float
-    weight_decay: float
-    warmup_epochs: float
-    clip_norm: float  # global norm of a network's gradient
-    ema_decay: float  # of the moving average of the weights, which then is what is kept
-    log_every: int
-    validate_every: int
-    checkpoint_every: int
-    validation_pairs: int
-    devices: int  # XLA devices on a CPU; 0: one for each core
-
-    def __post_init__(self):
-        """Refuse cadences that do not fit each other: a resumed log must equal an unbroken one."""
-        for name in ("log_every", "validate_every", "checkpoint_every", "validation_pairs"):
-            value = getattr(self, name)
-            if value < 1:
-                raise ValueError(f"config.train.{name} must be at least 1; got {value}.")
-            if name.endswith("_every") and value % self.log_every:
-                raise ValueError(
-                    f"config.train.{name} must be a multiple of config.train.log_every = "
-                    f"{self.log_every}; got {value}. Change one of the two."
-                )
-
-
-@dataclasses.dataclass(frozen=True)
-class OverlapConfig:
-    """Stage 1: the overlap network."""
-
-    epochs: float
-    batch_size: int
-    learning_rate: float
-    gamma: float  # of the focal loss
-
-    def __post_init__(self):
-        """Refuse a stage of nothing."""
-        _check_stage("overlap", self)
-
-
-@dataclasses.dataclass(frozen=True)
-class RegistrationConfig:
-    """Stage 2: the registration network behind the frozen overlap network.
-
-    ``masks`` says which points it is given: those that the overlap network "predicted"; those
-    that overlap in "truth"; or "perturbed" ones (`pairs.perturbed_overlap`), with the true ones
-    for validation. The last two need no stage 1.
-    """
-
-    epochs: float
-    batch_size: int
-    learning_rate: float
-    masks: str
-    weights: LossWeights
-
-    def __post_init__(self):
-        """Refuse a stage of nothing, and masks that there are not."""
-        _check_stage("registration", self)
-        if self.masks not in MASKS:
-            raise ValueError(
-                f"config.registration.masks must be one of {MASKS}; got {self.masks!r}. Choose one."
-            )
-
-
-@dataclasses.dataclass(frozen=True)
-class JointConfig:
-    """Both networks trained further together, each on what the other one makes of the pair.
-
-    The loss is the sum of both stages' losses, with their gamma and weights.
-    """
-
-    epochs: float
-    batch_size: int
-    learning_rate: float
-
-    def __post_init__(self):
-        """Refuse a stage of nothing."""
-        _check_stage("joint", self)
-
-
-@dataclasses.dataclass(frozen=True)
-class RunConfig:
-    """All of a configuration."""
-
-    model: ModelConfig
-    data: DataConfig
-    protocol: Protocol
-    train: TrainConfig
-    overlap: OverlapConfig
-    registration: RegistrationConfig
-    joint: JointConfig
+    config = ConfigDict({"method": method})
+    for name, record in _sections(method).items():
+        config[name] = ConfigDict(dataclasses.asdict(record()))
+    if len(STAGES[method]) > 1:
+        for stage in STAGES[method]:
+            for field in ("batch_size", "learning_rate"):
+                config[stage][field] = config.train.get_oneway_ref(field)
+    return config.lock()
 
 
 def read_config(config: ConfigDict) -> RunConfig:
     """The records of a configuration.
 
     Raises:
-        ValueError: an unknown field (the nearest valid one is named), a missing one, or a value
-            that its record refuses.
+        ValueError: an unknown method or field (the nearest valid one is named), a missing one, or a
+            value that its record refuses.
     """
-    return read_record(RunConfig, config.to_dict(), "config")
+    given = config.to_dict()
+    method = given.pop("method", DEFAULT_METHOD)
+    if not isinstance(method, str) or method not in LEARNED:
+        raise ValueError(
+            f"config.method must be one of {', '.join(LEARNED)}; got {method!r}. Choose one."
+        )
+    sections = _sections(method)
+    _require_known(given, sections, "config", "the sections of the method")
+    missing = [name for name in sections if name not in given]
+    if missing:
+        raise ValueError(
+            f"config must hold every section of the method {method}; it lacks "
+            f"{', '.join(missing)}. Start from `default_config` and state only the differences."
+        )
+    records = {
+        name: read_record(record, given[name], f"config.{name}")
+        for name, record in sections.items()
+    }
+    stages = {name: records.pop(name) for name in STAGES[method]}
+    return RunConfig(method=method, stages=stages, **records)
+
+
+def _sections(method: str) -> dict[str, type]:
+    """The records of a configuration by their names in it."""
+    shared = {"model": LEARNED[method].config, "data": DataConfig, "protocol": Protocol}
+    stages = {name: stage.record for name, stage in STAGES[method].items()}
+    return {**shared, "train": TrainConfig, **stages}
+
+
+def _require_known(given: Mapping[str, Any], known: Mapping[str, Any], where: str, of: str) -> None:
+    for name in given:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1, cutoff=0.0)[0]
+            raise ValueError(
+                f"{where} must hold only {of}; got {where}.{name}. Did you mean {where}.{near}?"
+            )
 
 
 def read_record(record: type, section: Mapping[str, Any], where: str) -> Any:
-    """``record`` from a mapping with exactly its fields; nested records from nested mappings."""
+    """``record`` from a mapping of its fields, the others at their defaults; nested ones alike."""
     types = typing.get_type_hints(record)
-    for name in section:
-        if name not in types:
-            near = difflib.get_close_matches(name, types, n=1, cutoff=0.0)[0]
-            raise ValueError(
-                f"{where} must hold only the fields of {record.__name__}; got {where}.{name}. "
-                f"Did you mean {where}.{near}?"
-            )
-    optional = {
-        field.name
-        for field in dataclasses.fields(record)
-        if field.default is not dataclasses.MISSING
+    _require_known(section, types, where, f"the fields of {record.__name__}")
+    values = {
+        name: _read_value(types[name], value, f"{where}.{name}") for name, value in section.items()
     }
-    missing = [name for name in types if name not in section and name not in optional]
-    if missing:
+    try:
+        return record(**values)
+    except ValueError as error:
+        if str(error).startswith("config."):
+            raise
+        raise ValueError(f"in {where}: {error}") from error
+
+
+def _read_value(kind: Any, value: Any, where: str) -> Any:
+    """A field's value: of the field's type, and finite; for a nested record, the record."""
+    if dataclasses.is_dataclass(kind):
+        if not isinstance(value, Mapping):
+            raise ValueError(
+                f"{where} must be a section of fields; got {value!r:.60}. Start from a config in "
+                "configs/."
+            )
+        return read_record(typing.cast(type, kind), value, where)
+    if typing.get_origin(kind) is tuple:
+        if not isinstance(value, tuple | list):
+            raise ValueError(
+                f"{where} must be of type tuple; got {value!r:.60} ({type(value).__name__}). Give "
+                "a value of that type."
+            )
+        inside = typing.get_args(kind)
+        kinds = inside[:1] * len(value) if inside[-1:] == (...,) else inside
+        if len(kinds) != len(value):
+            raise ValueError(
+                f"{where} must be {len(kinds)} values; got {len(value)}. Give so many."
+            )
+        return tuple(map(_read_value, kinds, value, [where] * len(value)))
+    accepted = (int, float) if kind is float else kind
+    if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
         raise ValueError(
-            f"{where} must hold every field of {record.__name__}; it lacks {', '.join(missing)}. "
-            "Start from a config in configs/ and state only the differences."
+            f"{where} must be of type {kind.__name__}; got {value!r:.60} "
+            f"({type(value).__name__}). Give a value of that type."
         )
-    return record(
-        **{
-            name: read_record(types[name], value, f"{where}.{name}")
-            if dataclasses.is_dataclass(types[name])
-            else value
-            for name, value in section.items()
-        }
-    )
+    if isinstance(value, int | float) and not abs(value) < LARGEST:
+        raise ValueError(
+            f"{where} must be finite and below {LARGEST:g}; got {value!r:.60}. Give such a number."
+        )
+    return float(value) if kind is float else value
 
 
 def stage_record(config: RunConfig, stage: str) -> dict[str, Any]:
-    """What decides the outcome of a stage, as plain JSON values: a run may resume only with it."""
-    record = dataclasses.asdict(config)
+    """What decides the outcome of a stage, as plain JSON values: a run may resume only with it.
+
+    Where the rate is constant but for the last epochs, a run may be prolonged or cut short.
+    """
+    stages = (*STAGES[config.method][stage].reads, stage)
+    record = {
+        name: dataclasses.asdict(section)
+        for name, section in (
+            ("model", config.model),
+            ("data", config.data),
+            ("protocol", config.protocol),
+            ("train", config.train),
+            *((name, config.stages[name]) for name in stages),
+        )
+    }
+    if config.train.schedule == "constant":
+        del record[stage]["epochs"]
     for name in ("devices", "batch_size", "learning_rate"):  # the stage holds the last two
         del record["train"][name]
-    parts = ("overlap", "registration", "joint") if stage == "joint" else (stage,)
-    return {name: record[name] for name in ("model", "data", "protocol", "train", *parts)}
+    return record if config.method == DEFAULT_METHOD else {"method": config.method, **record}
 
 
-def _check_stage(name: str, stage: OverlapConfig | RegistrationConfig | JointConfig) -> None:
-    if stage.epochs <= 0 or stage.batch_size < 1:
-        raise ValueError(
-            f"config.{name} must have epochs > 0 and batch_size >= 1; got epochs={stage.epochs}, "
-            f"batch_size={stage.batch_size}."
-        )
+def stage_defaults(config: RunConfig) -> dict[str, Any]:
+    """`stage_record` at the defaults: what the fields of older releases' runs are completed by."""
+    return {name: dataclasses.asdict(record()) for name, record in _sections(config.method).items()}
 
 
 def parse_flags(arguments: list[str]) -> list[str]:
@@ -195,6 +178,8 @@ def parse_flags(arguments: list[str]) -> list[str]:
             f"error: only fields of the configuration can be set; it has no {field}. "
             f"{' '.join(hint)}".rstrip()
         ) from None
+    except (ValueError, TypeError) as error:  # a value that is of another type than its field
+        raise SystemExit(f"error: {error}") from None
     path = config_flags.get_config_filename(flags.FLAGS["config"])
     if not Path(path).is_file():
         raise SystemExit(

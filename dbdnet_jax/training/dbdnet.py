@@ -1,4 +1,4 @@
-"""The stages of training: what each one trains, behind what, and how it is judged.
+"""DBDNet's stages: what each one lowers, and how it is judged.
 
 "overlap" trains the overlap network; "registration" trains the registration network behind it,
 frozen and deterministic (the released code leaves the frozen network's dropout on). "joint", which
@@ -8,169 +8,110 @@ the paper does not have, then trains both on what they make of a pair together.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dbdnet_jax.data.pairs import initial_pose, perturbed_overlap, transform_source
-from dbdnet_jax.io.safe_pickle import CheckpointError
-from dbdnet_jax.metrics.pose import pair_confusion, registration_errors
+from dbdnet_jax.metrics.pose import (
+    motion_errors,
+    overlap_error,
+    overlap_f1,
+    pair_confusion,
+)
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.dbdnet.register import (
     predict_overlap_and_matches,
     register_clouds,
     register_given_overlap,
 )
-from dbdnet_jax.networks.params import (
-    Params,
-    flatten,
-    init_params,
-    parameter_shapes,
-    require_shapes,
-)
-from dbdnet_jax.networks.weights import load_params
+from dbdnet_jax.networks.params import Params
 from dbdnet_jax.ops import rigid
-from dbdnet_jax.training.checkpoint import JOINT, STAGES, load_best
-from dbdnet_jax.training.config import RunConfig
-from dbdnet_jax.training.losses import JointTerms, overlap_loss, registration_loss
+from dbdnet_jax.training.losses import JointTerms, LossWeights, overlap_loss, registration_loss
+from dbdnet_jax.training.task import check_stage
 from dbdnet_jax.types import Pair, Registration, Rigid
 
-# (trainable, frozen, pair, key) -> (loss, NamedTuple of its terms)
-LossFunction = Callable[[Any, Any, Pair, PRNGKeyArray], tuple[Float[Array, ""], Any]]
-# (trainable, frozen, pair) -> scalars by name; "error", the smaller the better, chooses the best
-Validation = Callable[[Any, Any, Pair], dict[str, Float[Array, ""]]]
+MASKS = ("predicted", "truth", "perturbed")
 
 
-class Task(NamedTuple):
-    """One stage: the parameters it trains and those it leaves alone, its loss, its judge.
+@dataclasses.dataclass(frozen=True)
+class OverlapConfig:
+    """Stage 1: the overlap network. The defaults are the paper's for ModelNet40."""
 
-    Where it trains several ``networks``, ``trainable`` holds them by these names.
+    epochs: float = 300.0
+    batch_size: int = 8
+    learning_rate: float = 1e-4
+    gamma: float = 4.0  # of the focal loss
+
+    def __post_init__(self):
+        """Refuse a stage of nothing."""
+        check_stage("overlap", self)
+
+
+@dataclasses.dataclass(frozen=True)
+class RegistrationConfig:
+    """Stage 2: the registration network behind the frozen overlap network.
+
+    ``masks`` says which points it is given: those that the overlap network "predicted"; those
+    that overlap in "truth"; or "perturbed" ones (`pairs.perturbed_overlap`), with the true ones
+    for validation. The last two need no stage 1.
     """
 
-    trainable: Any
-    frozen: Any
-    loss: LossFunction
-    validate: Validation
-    networks: tuple[str, ...] = ()
+    epochs: float = 300.0
+    batch_size: int = 8
+    learning_rate: float = 1e-4
+    masks: str = "predicted"
+    weights: LossWeights = LossWeights()
+
+    def __post_init__(self):
+        """Refuse a stage of nothing, and masks that there are not."""
+        check_stage("registration", self)
+        if self.masks not in MASKS:
+            raise ValueError(
+                f"config.registration.masks must be one of {MASKS}; got {self.masks!r}. Choose one."
+            )
 
 
-def make_task(config: RunConfig, stage: str, run_dir: str | Path) -> Task:
-    """The task of a stage, from fresh parameters.
+@dataclasses.dataclass(frozen=True)
+class JointConfig:
+    """Both networks trained further together, each on what the other one makes of the pair.
 
-    Raises:
-        CheckpointError: "registration" without a trained overlap network in ``run_dir``; "joint"
-            without both networks there or in ``config.train.start``.
+    The loss is the sum of both stages' losses, with their gamma and weights.
     """
-    model = config.model
-    if stage == JOINT:
-        loss, validate = _joint_functions(config)
-        return Task(_both_trained(config, run_dir), None, loss, validate, STAGES)
-    fresh = _first_params(config)
-    if stage == "overlap":
-        loss, validate = _overlap_functions(config)
-        return Task(fresh.overlap, None, loss, validate)
-    loss, validate = _registration_functions(config)
-    predicted = config.registration.masks == "predicted"
-    frozen = _trained_overlap(model, run_dir) if predicted else None
-    return Task(fresh.registration, frozen, loss, validate)
+
+    epochs: float = 30.0
+    batch_size: int = 8
+    learning_rate: float = 1e-4
+
+    def __post_init__(self):
+        """Refuse a stage of nothing."""
+        check_stage("joint", self)
 
 
-def _first_params(config: RunConfig) -> Params:
-    """Fresh parameters, or those of ``config.train.start`` where it holds the network."""
-    fresh = init_params(jax.random.key(config.train.seed), config.model)
-    if not config.train.start:
-        return fresh
-    start = _start_params(config)
-    return Params(
-        start.overlap or fresh.overlap, start.registration or fresh.registration, config.model
+def overlap_loss_of(
+    model: ModelConfig, gamma: float, trainable: Any, frozen: None, pair: Pair, key: PRNGKeyArray
+) -> tuple[Float[Array, ""], Any]:
+    """The overlap network's loss on one pair; of several passes, one from a start of its own."""
+    params = Params({"overlap": trainable}, model)
+    start_key, dropout_key = jax.random.split(key)
+    # Each pass is trained for itself, from starts such as the passes before it may leave.
+    start = initial_pose(start_key, pair) if model.overlap_passes > 1 else None
+    source, target, matched = predict_overlap_and_matches(
+        params, pair.source, pair.target, dropout_key if model.dropout else None, start
     )
+    return overlap_loss(source, target, pair, gamma, matched)
 
 
-def _start_params(config: RunConfig) -> Params:
-    """The networks in ``config.train.start``: one or both, of the configuration's widths."""
-    if not Path(config.train.start).is_file():
-        raise FileNotFoundError(
-            "config.train.start must be a file of weights; there is none at "
-            f"{config.train.start}. Give its path, or '' to start from fresh weights."
-        )
-    start = load_params(config.train.start)
-    held = [name for name in STAGES if getattr(start, name) is not None]
-    require_shapes(
-        {name: array.shape for name, array in flatten(start).items()},
-        parameter_shapes(config.model, held),
-        f"config.train.start={config.train.start}",
-        "Give weights of the same widths as config.model, or set config.train.start=''.",
-    )
-    return dataclasses.replace(start, config=config.model)
-
-
-def _both_trained(config: RunConfig, run_dir: str | Path) -> dict[str, Any]:
-    """Both networks of the run or, where it has none, of ``config.train.start``."""
-    params, where = None, str(run_dir)
-    if any((Path(run_dir) / stage).is_dir() for stage in STAGES):
-        params = load_best(run_dir, joint=False)
-        _require_model(params, config.model, run_dir)
-    elif config.train.start:
-        params, where = _start_params(config), config.train.start
-    if params is None or params.overlap is None or params.registration is None:
-        raise CheckpointError(
-            f"the joint stage goes on from two trained networks; {where} does not hold both. Train "
-            "them in that folder first (--stage=both), or give a new --run_dir and "
-            "--config.train.start=FILE with both."
-        )
-    return {"overlap": params.overlap, "registration": params.registration}
-
-
-def _trained_overlap(model: ModelConfig, run_dir: str | Path) -> Any:
-    has_one = (Path(run_dir) / "overlap").is_dir()
-    params = load_best(run_dir, joint=False) if has_one else None
-    if params is None or params.overlap is None:
-        raise CheckpointError(
-            f"the registration stage needs a trained overlap network; {run_dir} has none. Train "
-            "it first (--stage=overlap or both), or set config.registration.masks='truth'."
-        )
-    _require_model(params, model, run_dir)
-    return params.overlap
-
-
-def _require_model(params: Params, model: ModelConfig, run_dir: str | Path) -> None:
-    if params.config != model:
-        raise CheckpointError(
-            f"both networks of a run must be of one configuration; {run_dir} holds one of "
-            f"{params.config}, config.model is {model}. Give another --run_dir."
-        )
-
-
-def _overlap_functions(config: RunConfig) -> tuple[LossFunction, Validation]:
-    model, gamma = config.model, config.overlap.gamma
-
-    def loss(trainable, frozen, pair, key):
-        params = Params(trainable, None, model)
-        start_key, dropout_key = jax.random.split(key)
-        dropout_key = dropout_key if model.dropout else None
-        # Each pass is trained for itself, from starts such as the passes before it may leave.
-        start = initial_pose(start_key, pair) if model.overlap_passes > 1 else None
-        *predicted, matched = predict_overlap_and_matches(
-            params, pair.source, pair.target, dropout_key, start
-        )
-        return overlap_loss(*predicted, pair, gamma, matched)
-
-    def validate(trainable, frozen, pair):
-        params = Params(trainable, None, model)
-        *predicted, matched = predict_overlap_and_matches(params, pair.source, pair.target)
-        counts = pair_confusion(*predicted, pair)
-        wrong = counts.false_positive + counts.false_negative
-        return {
-            "error": wrong / (wrong + counts.true_positive + counts.true_negative),
-            "loss": overlap_loss(*predicted, pair, gamma, matched)[0],
-            "f1": 2 * counts.true_positive / jnp.maximum(2 * counts.true_positive + wrong, 1),
-        }
-
-    return loss, validate
+def validate_overlap(
+    model: ModelConfig, gamma: float, trainable: Any, frozen: None, pair: Pair
+) -> dict[str, Float[Array, ""]]:
+    """The share of points of the wrong class after all passes, the loss, and F1."""
+    params = Params({"overlap": trainable}, model)
+    source, target, matched = predict_overlap_and_matches(params, pair.source, pair.target)
+    counts = pair_confusion(source, target, pair)
+    loss = overlap_loss(source, target, pair, gamma, matched)[0]
+    return {"error": overlap_error(counts), "loss": loss, "f1": overlap_f1(counts)}
 
 
 def _from_anywhere(model: ModelConfig) -> bool:
@@ -178,96 +119,130 @@ def _from_anywhere(model: ModelConfig) -> bool:
     return (model.overlap_passes > 1 or model.iterations > 1) and not model.released
 
 
-def _registration_functions(config: RunConfig) -> tuple[LossFunction, Validation]:
-    model, stage = config.model, config.registration
-
-    def given(key, frozen, pair, start):
-        if stage.masks == "predicted":
-            params = Params(frozen, None, model)
-            return predict_overlap_and_matches(params, pair.source, pair.target, start=start)[:2]
-        if stage.masks == "perturbed":
-            return perturbed_overlap(key, pair, config.protocol.overlap_radius)
-        return pair.source_overlap, pair.target_overlap
-
-    def answer(trainable, pair, masks, key=None, model=model):
-        params = Params(None, trainable, model)
-        masks = [mask * 1.0 for mask in masks]
-        return register_given_overlap(params, pair.source, pair.target, *masks, key)
-
-    def loss(trainable, frozen, pair, key):
-        mask_key, start_key, dropout_key = jax.random.split(key, 3)
-        start = initial_pose(start_key, pair) if _from_anywhere(model) else None
-        masks = given(mask_key, frozen, pair, start)
-        one = model
-        if start is not None:
-            pair = transform_source(pair, start)
-            one = dataclasses.replace(model, iterations=1)
-        dropout_key = dropout_key if model.dropout else None
-        found = answer(trainable, pair, masks, dropout_key, one)
-        return registration_loss(found, pair, stage.weights)
-
-    def validate(trainable, frozen, pair):
-        if stage.masks == "predicted":
-            found = register_clouds(Params(frozen, trainable, model), pair.source, pair.target)
-        else:
-            as_often = dataclasses.replace(model, iterations=model.solves)
-            truth = pair.source_overlap, pair.target_overlap
-            found = answer(trainable, pair, truth, model=as_often)
-        errors = registration_errors(found, pair)
-        return {
-            "error": errors.rotation_deg,
-            "translation_error": errors.translation,
-            "loss": registration_loss(found, pair, stage.weights)[0],
-        }
-
-    return loss, validate
+def registration_loss_of(
+    model: ModelConfig,
+    stage: RegistrationConfig,
+    overlap_radius: float,
+    trainable: Any,
+    frozen: Any,
+    pair: Pair,
+    key: PRNGKeyArray,
+) -> tuple[Float[Array, ""], Any]:
+    """The registration network's loss on one pair, given the points that ``stage`` says."""
+    mask_key, start_key, dropout_key = jax.random.split(key, 3)
+    start = initial_pose(start_key, pair) if _from_anywhere(model) else None
+    if stage.masks == "predicted":
+        overlap_network = Params({"overlap": frozen}, model)
+        masks = predict_overlap_and_matches(overlap_network, pair.source, pair.target, start=start)[
+            :2
+        ]
+    elif stage.masks == "perturbed":
+        masks = perturbed_overlap(mask_key, pair, overlap_radius)
+    else:
+        masks = pair.source_overlap, pair.target_overlap
+    if start is not None:
+        pair = transform_source(pair, start)
+        model = dataclasses.replace(model, iterations=1)
+    found = _register_given(model, trainable, pair, masks, dropout_key if model.dropout else None)
+    return registration_loss(found, pair, stage.weights)
 
 
-def _joint_functions(config: RunConfig) -> tuple[LossFunction, Validation]:
-    model, gamma, weights = config.model, config.overlap.gamma, config.registration.weights
-    one = dataclasses.replace(model, iterations=1) if _from_anywhere(model) else model
-
-    def turn(networks, pair, start, dropout_key=None):
-        """One pass, and the registration of what it found: from the start, if there is one."""
-        params = Params(networks["overlap"], networks["registration"], one)
-        *overlap, matched = predict_overlap_and_matches(
-            params, pair.source, pair.target, dropout_key, start
-        )
-        moved = pair if start is None else transform_source(pair, start)
-        found = register_given_overlap(params, moved.source, moved.target, *overlap, dropout_key)
-        return overlap, matched, found, moved
-
-    def own_start(networks, pair, start):
-        found: Registration = turn(networks, pair, start)[2]
-        return rigid.compose(Rigid(found.rotation, found.translation), start)
-
-    def loss(trainable, frozen, pair, key):
-        start_key, choice_key, dropout_key = jax.random.split(key, 3)
-        start = None
-        if _from_anywhere(model):
-            # Half of the pairs go on from where a turn of the networks themselves brings them.
-            start = jax.lax.cond(
-                jax.random.uniform(choice_key) < 0.5,
-                lambda motion: own_start(jax.lax.stop_gradient(trainable), pair, motion),
-                lambda motion: motion,
-                initial_pose(start_key, pair),
-            )
-        dropout_key = dropout_key if model.dropout else None
-        overlap, matched, found, moved = turn(trainable, pair, start, dropout_key)
-        first, overlap_terms = overlap_loss(*overlap, pair, gamma, matched)
-        second, registration_terms = registration_loss(found, moved, weights)
-        return first + second, JointTerms(*overlap_terms, *registration_terms)
-
-    def validate(trainable, frozen, pair):
-        params = Params(trainable["overlap"], trainable["registration"], model)
+def validate_registration(
+    model: ModelConfig, stage: RegistrationConfig, trainable: Any, frozen: Any, pair: Pair
+) -> dict[str, Float[Array, ""]]:
+    """Errors of the pose after all turns: behind the overlap network, or given the true overlap."""
+    if stage.masks == "predicted":
+        params = Params({"overlap": frozen, "registration": trainable}, model)
         found = register_clouds(params, pair.source, pair.target)
-        errors = registration_errors(found, pair)
-        counts = pair_confusion(found.src_overlap, found.tgt_overlap, pair)
-        wrong = counts.false_positive + counts.false_negative
-        return {
-            "error": errors.rotation_deg,
-            "translation_error": errors.translation,
-            "overlap_error": wrong / (wrong + counts.true_positive + counts.true_negative),
-        }
+    else:
+        as_often = dataclasses.replace(model, iterations=model.solves)
+        truth = pair.source_overlap, pair.target_overlap
+        found = _register_given(as_often, trainable, pair, truth)
+    errors = motion_errors(found.motion, pair.target_from_source)
+    return {
+        "error": errors.rotation_deg,
+        "translation_error": errors.translation,
+        "loss": registration_loss(found, pair, stage.weights)[0],
+    }
 
-    return loss, validate
+
+def _register_given(model, trainable, pair, masks, dropout_key=None) -> Registration:
+    params = Params({"registration": trainable}, model)
+    source, target = (mask * 1.0 for mask in masks)
+    return register_given_overlap(params, pair.source, pair.target, source, target, dropout_key)
+
+
+def joint_turn(
+    model: ModelConfig,
+    networks: dict[str, Any],
+    pair: Pair,
+    start: Rigid | None,
+    dropout_key: PRNGKeyArray | None = None,
+):
+    """One pass, and the registration of what it found: from the start, if there is one.
+
+    Returns both clouds' overlap, the matches, the registration, and the pair it is of.
+    """
+    params = Params(networks, model)
+    source, target, matched = predict_overlap_and_matches(
+        params, pair.source, pair.target, dropout_key, start
+    )
+    moved = pair if start is None else transform_source(pair, start)
+    found = register_given_overlap(params, moved.source, moved.target, source, target, dropout_key)
+    return (source, target), matched, found, moved
+
+
+def joint_start(
+    model: ModelConfig,
+    networks: dict[str, Any],
+    pair: Pair,
+    start_key: PRNGKeyArray,
+    choice_key: PRNGKeyArray,
+) -> Rigid:
+    """Half of the pairs go on from where a turn of the networks themselves brings them."""
+    networks = jax.lax.stop_gradient(networks)
+
+    def own(start: Rigid) -> Rigid:
+        found: Registration = joint_turn(model, networks, pair, start)[2]
+        return rigid.compose(found.motion, start)
+
+    given = initial_pose(start_key, pair)
+    return jax.lax.cond(jax.random.uniform(choice_key) < 0.5, own, lambda start: start, given)
+
+
+def joint_loss_of(
+    model: ModelConfig,
+    gamma: float,
+    weights: LossWeights,
+    trainable: dict[str, Any],
+    frozen: None,
+    pair: Pair,
+    key: PRNGKeyArray,
+) -> tuple[Float[Array, ""], JointTerms]:
+    """Both losses of one turn of both networks."""
+    start_key, choice_key, dropout_key = jax.random.split(key, 3)
+    start = None
+    if _from_anywhere(model):
+        model = dataclasses.replace(model, iterations=1)
+        start = joint_start(model, trainable, pair, start_key, choice_key)
+    overlap, matched, found, moved = joint_turn(
+        model, trainable, pair, start, dropout_key if model.dropout else None
+    )
+    source, target = overlap
+    first, overlap_terms = overlap_loss(source, target, pair, gamma, matched)
+    second, registration_terms = registration_loss(found, moved, weights)
+    return first + second, JointTerms(*overlap_terms, *registration_terms)
+
+
+def validate_joint(
+    model: ModelConfig, trainable: dict[str, Any], frozen: None, pair: Pair
+) -> dict[str, Float[Array, ""]]:
+    """Errors of the pose and of the overlap after all turns."""
+    found = register_clouds(Params(trainable, model), pair.source, pair.target)
+    errors = motion_errors(found.motion, pair.target_from_source)
+    counts = pair_confusion(found.src_overlap, found.tgt_overlap, pair)
+    return {
+        "error": errors.rotation_deg,
+        "translation_error": errors.translation,
+        "overlap_error": overlap_error(counts),
+    }

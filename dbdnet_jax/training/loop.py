@@ -1,9 +1,7 @@
-"""Training in stages: a pure step, and the loop that keeps its results.
+"""Training in stages: the loop that takes the steps of any task and keeps its results.
 
-Stage "overlap" trains the overlap network, stage "registration" the registration network behind
-it, frozen and deterministic; stage "joint" may train both further. Everything random comes from
-``fold_in(key, step)``: a run that was killed and started again ends with the same parameters, bit
-for bit on a CPU.
+Everything random comes from ``fold_in(key, step)``: a run that was killed and started again ends
+with the same parameters, bit for bit on a CPU.
 """
 
 from __future__ import annotations
@@ -14,94 +12,22 @@ import math
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import flax.struct
 import jax
-import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array
 
 from dbdnet_jax.data.training_pairs import PairStream
 from dbdnet_jax.training.checkpoint import Checkpoints, write_stage
-from dbdnet_jax.training.config import RunConfig, TrainConfig, stage_record
-from dbdnet_jax.training.dbdnet import LossFunction, Task, make_task
+from dbdnet_jax.training.config import stage_defaults, stage_record
 from dbdnet_jax.training.optimizer import make_optimizer, make_schedule
 from dbdnet_jax.training.parallel import mean_over_pairs, on_all_devices
 from dbdnet_jax.training.runlog import RunLog
+from dbdnet_jax.training.step import StepMetrics, TrainState, init_state, train_step, weights_of
+from dbdnet_jax.training.table import STAGES
+from dbdnet_jax.training.task import RunConfig, Task, TrainConfig
 from dbdnet_jax.types import Pair
-
-
-@flax.struct.dataclass
-class TrainState:
-    """Everything that a step changes: ``step`` counts those taken, as an int32 scalar.
-
-    ``ema`` is None where no moving average is kept.
-    """
-
-    step: Any
-    params: Any
-    opt_state: Any
-    ema: Any
-
-
-class StepMetrics(NamedTuple):
-    """What a step says of itself: means over its pairs, before the update."""
-
-    loss: Float[Array, ""]
-    terms: Any
-    gradient_norm: Float[Array, ""]
-    finite: Bool[Array, ""]
-
-
-def init_state(
-    trainable: Any, optimizer: optax.GradientTransformation, *, ema_decay: float = 0.0
-) -> TrainState:
-    """The state before the first step."""
-    ema = jax.tree.map(jnp.copy, trainable) if ema_decay else None
-    return TrainState(jnp.zeros((), jnp.int32), trainable, optimizer.init(trainable), ema)
-
-
-def train_step(
-    state: TrainState,
-    frozen: Any,
-    key: PRNGKeyArray,
-    arrays: Any,
-    *,
-    draw: Callable[[PRNGKeyArray, Int[Array, ""], Any], Pair],
-    loss: LossFunction,
-    optimizer: optax.GradientTransformation,
-    batch_size: int,
-    ema_decay: float = 0.0,
-) -> tuple[TrainState, StepMetrics]:
-    """One step on ``batch_size`` fresh pairs; pure, so its result depends on the arguments only.
-
-    Where the loss, a term or the gradient is not finite the state comes back as it was, step
-    count included: the same step would be taken again, and fail again, until the caller stops.
-    """
-
-    def one(i, params, frozen, step, key, arrays):
-        draw_key, loss_key = jax.random.split(jax.random.fold_in(key, i))
-        pair = draw(draw_key, step * batch_size + i, arrays)
-        return jax.value_and_grad(loss, has_aux=True)(params, frozen, pair, loss_key)
-
-    step_key = jax.random.fold_in(key, state.step)
-    (total, terms), gradient = mean_over_pairs(
-        one, batch_size, state.params, frozen, state.step, step_key, arrays
-    )
-    norm = optax.tree.norm(gradient)
-    finite = jnp.isfinite(jnp.stack([total, norm, *jax.tree.leaves(terms)])).all()
-
-    updates, opt_state = optimizer.update(gradient, state.opt_state, state.params)
-    params = optax.apply_updates(state.params, updates)
-    ema = state.ema
-    if ema_decay:
-        # The first weights are noise: a short memory at first forgets them.
-        decay = jnp.minimum(ema_decay, (1 + state.step) / (10 + state.step))
-        ema = jax.tree.map(lambda old, new: old + (1 - decay) * (new - old), ema, params)
-    moved = TrainState(state.step + 1, params, opt_state, ema)
-    state = jax.tree.map(lambda new, old: jnp.where(finite, new, old), moved, state)
-    return state, StepMetrics(total, terms, norm, finite)
 
 
 def fit(config: RunConfig, stage: str, run_dir: str | Path, stream: PairStream) -> None:
@@ -116,9 +42,9 @@ def fit(config: RunConfig, stage: str, run_dir: str | Path, stream: PairStream) 
             where the last good state is.
     """
     folder = Path(run_dir) / stage
-    task = make_task(config, stage, run_dir)
-    write_stage(folder, stage_record(config, stage))
-    part = getattr(config, stage)
+    task = STAGES[config.method][stage].make_task(config, run_dir)
+    write_stage(folder, stage_record(config, stage), stage_defaults(config))
+    part = config.stages[stage]
     run_task(
         task,
         stream,
@@ -143,15 +69,26 @@ def run_task(
     """`fit` for any task."""
     epoch_steps = max(1, stream.epoch_pairs // batch_size)
     total = max(1, round(epochs * epoch_steps))
-    schedule = make_schedule(learning_rate, total, round(train.warmup_epochs * epoch_steps))
+    schedule = make_schedule(
+        learning_rate,
+        total,
+        round(train.warmup_epochs * epoch_steps),
+        kind=train.schedule,
+        milestones=[round(epoch * epoch_steps) for epoch in train.milestones],
+        factor=train.factor,
+        decay_steps=round(train.decay_epochs * epoch_steps),
+    )
     optimizer = make_optimizer(
         schedule,
         weight_decay=train.weight_decay,
         clip_norm=train.clip_norm,
         networks=task.networks,
+        kind=train.optimizer,
     )
     with Checkpoints(folder) as checkpoints:
-        state = init_state(task.trainable, optimizer, ema_decay=train.ema_decay)
+        state = init_state(
+            task.trainable, optimizer, ema_decay=train.ema_decay, batch_stats=task.batch_stats
+        )
         start = checkpoints.latest_step() or 0
         if start:
             state = checkpoints.restore(start, state)
@@ -238,19 +175,19 @@ class _Loop:
     def _validate_and_save(
         self, done: int, state: TrainState, validate: Callable[..., Any], frozen: Any, pairs: Pair
     ) -> None:
-        means = validate(state.params if state.ema is None else state.ema, frozen, pairs)
+        means = validate(state, frozen, pairs)
         row = {name: float(value) for name, value in means.items()}
         self._require_finite(row, state, "in the validation")
         self.log.write("validation", done, row)
         self.checkpoints.save(done, state, row["error"])
 
-    def _mean_validation(self, weights: Any, frozen: Any, pairs: Pair) -> dict[str, Array]:
+    def _mean_validation(self, state: TrainState, frozen: Any, pairs: Pair) -> dict[str, Array]:
         def one(i, weights, frozen, pairs):
             pair = jax.tree.map(lambda leaf: leaf[i], pairs)
             return self.task.validate(weights, frozen, pair)
 
         count = pairs.source.count.shape[0]
-        return mean_over_pairs(one, count, weights, frozen, pairs)
+        return mean_over_pairs(one, count, weights_of(state), frozen, pairs)
 
     def _require_finite(self, scalars: dict[str, float], state: TrainState, where: str) -> None:
         """Stop at the first value that is not finite, with the last good state on disk."""

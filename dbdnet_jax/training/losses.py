@@ -13,7 +13,6 @@ from jaxtyping import Array, Bool, Float
 from dbdnet_jax.networks.dbdnet.matching import SoftMatches
 from dbdnet_jax.ops.grouping import squared_distances
 from dbdnet_jax.ops.rigid import HIGHEST, apply
-from dbdnet_jax.ops.sampling import prefix_mask
 from dbdnet_jax.types import Branch, Cloud, Pair, Registration, Rigid
 
 SMALLEST_PROBABILITY = 1e-12  # keeps log finite once a float32 sigmoid has saturated
@@ -132,7 +131,7 @@ def matching_loss(
     A point's label is a bell of `MATCH_WIDTH` around its true place in the other cloud; without a
     point there, the label is to keep its mass back.
     """
-    valid = _valid_rows(source), _valid_rows(target)
+    valid = source.valid, target.valid
     both = valid[0][:, None] & valid[1][None, :]
     distance = squared_distances(apply(truth, source.points), target.points)
     near = both & (distance < (2.5 * MATCH_WIDTH) ** 2)
@@ -160,9 +159,8 @@ def overlap_loss(
 
     A network that also matches is judged by its matches and by the rotation they ask for.
     """
-    source_valid, target_valid = _valid_rows(pair.source), _valid_rows(pair.target)
-    source = focal_loss(source_probability, pair.source_overlap, source_valid, gamma)
-    target = focal_loss(target_probability, pair.target_overlap, target_valid, gamma)
+    source = focal_loss(source_probability, pair.source_overlap, pair.source.valid, gamma)
+    target = focal_loss(target_probability, pair.target_overlap, pair.target.valid, gamma)
     matching = jnp.zeros_like(source)
     if matched is not None:
         own, other = (Cloud(*cloud) for cloud in zip(*matched.clouds, strict=True))
@@ -178,11 +176,11 @@ def registration_loss(
 ) -> tuple[Float[Array, ""], RegistrationTerms]:
     """The weighted sum of correspondence, rotation, translation and distance losses."""
     truth = pair.target_from_source
-    valid = _valid_rows(pair.source)
+    valid = pair.source.valid
     # Zeroed before the product: a NaN in the padding would reach the motion's gradient through it.
     source = jnp.where(valid[:, None], pair.source.points, 0.0)
     true_targets = apply(truth, source)
-    registered = apply(Rigid(answer.rotation, answer.translation), source)
+    registered = apply(answer.motion, source)
     terms = RegistrationTerms(
         correspondence=weights.correspondence
         * correspondence_loss(
@@ -193,7 +191,3 @@ def registration_loss(
         distance=weights.distance * distance_loss(registered, true_targets, valid),
     )
     return jnp.stack(terms).sum(), terms
-
-
-def _valid_rows(cloud: Cloud) -> Bool[Array, " n"]:
-    return prefix_mask(len(cloud.points), cloud.count)

@@ -54,5 +54,18 @@ def mean_over_pairs(function: Callable[..., Any], count: int, *arguments: Any) -
     return jax.tree.map(lambda value: value / count, total)
 
 
+def stack_over_devices(function: Callable[..., Any], count: int) -> Any:
+    """``function(i)`` for i in 0..count-1, stacked, for what needs the whole batch at once.
+
+    On a CPU the XLA devices share the rows, and XLA divides what is computed from them the same
+    way; where the count is no multiple of the devices, each computes all of it.
+    """
+    values = jax.vmap(function)(jnp.arange(count))
+    if jax.default_backend() != "cpu" or count % jax.device_count():
+        return values
+    rows = NamedSharding(_cpu_mesh(), PartitionSpec("pairs"))
+    return jax.tree.map(lambda value: jax.lax.with_sharding_constraint(value, rows), values)
+
+
 def _cpu_mesh() -> Mesh:
     return jax.make_mesh((jax.device_count(),), ("pairs",), axis_types=(AxisType.Auto,))

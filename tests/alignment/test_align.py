@@ -8,27 +8,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from dbdnet_jax.alignment.align import Alignment
 from dbdnet_jax.alignment.downsampling import DENSE, UNIT_SIZE, downsample, farthest_rows
+from dbdnet_jax.alignment.finding import LIKELY
 from dbdnet_jax.alignment.normalised import is_full_resolution, normalise_pair
-from dbdnet_jax.alignment.quality import (
-    CHANCE_RATIO,
-    Motion,
-    assess_pose,
-    in_words,
-    inlier_distance,
-    shared_point_score,
-)
 from dbdnet_jax.alignment.success import (
     Coefficients,
+    FitFeatures,
+    Logistic,
     PoseFeatures,
     load_coefficients,
     success_probability,
 )
-from dbdnet_jax.alignment.validity import LIKELY
 from tests.aligning import motion, pair, rotation_error_deg, solid, tiny_align
+from tests.alignment.test_quality import cylinder
 from tests.conftest import random_cloud
 
 SOURCE, TARGET, TRUE = pair()
@@ -82,11 +76,11 @@ def test_the_timings_add_up_and_nothing_else_is_random(plain):
     again = tiny_align(SOURCE, TARGET, initial=TRUE)
     np.testing.assert_array_equal(again.transform, plain.transform)
     assert set(plain.timings) == {
+        "programs",
         "read",
         "weights",
         "downsample",
-        "network",
-        "refine",
+        "search",
         "quality",
         "overlap",
     }
@@ -149,7 +143,7 @@ def test_refinement_is_a_choice():
 def test_the_threshold_becomes_the_networks(monkeypatch):
     seen = []
 
-    def ask(params, *clouds):
+    def ask(params, *_):
         seen.append(params.config.overlap_threshold)
         raise KeyboardInterrupt
 
@@ -187,69 +181,6 @@ def test_auto_scale_brings_the_larger_cloud_to_the_weights_size():
     assert normalise_pair(SOURCE, TARGET, 2.5, 150, np.eye(4)).factor == 2.5
 
 
-def plane(count: int, seed: int) -> np.ndarray:
-    points = random_cloud(seed, count) * [0.7, 0.7, 0]
-    return points + 0.003 * np.random.default_rng(seed).normal(size=points.shape)
-
-
-def cylinder(count: int, seed: int) -> np.ndarray:
-    x, y, _ = random_cloud(seed, count).T
-    return np.stack([0.3 * np.cos(np.pi * x), 0.3 * np.sin(np.pi * x), y], axis=1)
-
-
-def sphere(count: int, seed: int) -> np.ndarray:
-    points = np.random.default_rng(seed).normal(size=(count, 3))
-    return points / np.linalg.norm(points, axis=1, keepdims=True)
-
-
-@pytest.mark.parametrize(
-    ("surface", "words"),
-    [
-        (plane, "translation along every axis normal to [0 0 1] and rotation about [0 0 1]"),
-        (cylinder, "translation along [0 0 1] and rotation about [0 0 1]"),
-        (sphere, "rotation about every axis"),
-        (solid, ""),
-    ],
-)
-def test_degenerate_motions_are_named(surface, words):
-    clouds = surface(3000, 1), surface(3000, 2)
-    quality = assess_pose(*clouds, inlier_distance(*clouds))
-    assert in_words(tuple(_snap(motion) for motion in quality.degenerate_motions)) == words
-
-
-def _snap(motion: Motion) -> Motion:
-    """The axis without its last degrees of noise, if it is an axis of the frame."""
-    near = np.abs(motion.direction) < 0.08
-    return motion if near.sum() < 2 else motion._replace(direction=np.where(near, 0, 1.0))
-
-
-def test_information_is_the_curvature_of_the_plane_residuals():
-    clouds = solid(2000, 1), solid(2000, 2)
-    quality = assess_pose(*clouds, inlier_distance(*clouds))
-    assert np.all(np.linalg.eigvalsh(quality.information) > 0)
-    # 2000 points that are off by plane_rmse fix a translation to about this, in each direction.
-    sigma = np.sqrt(np.diag(np.linalg.inv(quality.information))[3:])
-    assert np.all(sigma < 10 * quality.plane_rmse / np.sqrt(2000))
-
-
-@pytest.mark.parametrize("even", [False, True])
-def test_points_coincide_where_clouds_share_them_in_the_right_pose_only(even):
-    points, others = cylinder(2000, 1), cylinder(2000, 2)
-    if even:
-        points, others = (cloud[farthest_rows(cloud, 1200)] for cloud in (points, others))
-    turn = Rotation.from_rotvec([0, 0, 20], degrees=True).as_matrix()
-    spacing = np.median(cKDTree(points).query(points, k=2)[0][:, 1])
-    noisy = points + random_cloud(3, len(points)) * 0.2 * spacing
-
-    def between(source, target):
-        return shared_point_score(source, target, inlier_distance(source, target))
-
-    assert between(points, points) == CHANCE_RATIO
-    assert between(noisy, points) > 0.3
-    assert between(points @ turn.T, points) < 0.02 and between(others, points) < 0.02
-    assert between(points + 9.0, points) == 0.0
-
-
 def test_clouds_that_a_grid_has_thinned_are_not_asked_whether_points_coincide():
     few, many = (
         normalise_pair(c, c, "auto", 100, np.eye(4)) for c in (solid(500, 1), solid(11_000, 1))
@@ -274,14 +205,17 @@ def test_clouds_of_different_units_are_refused():
 
 
 def test_a_probability_is_a_logistic_of_standardised_evidence():
-    def evidence(value: float) -> PoseFeatures:
-        return PoseFeatures(*[value] * len(PoseFeatures._fields))
+    fields = len(PoseFeatures._fields)
+    fitted = Logistic((1.0,) * fields, (2.0,) * fields, (0.5,) * fields, -1.0)
+    unused = Logistic(*((1.0,) * len(FitFeatures._fields) for _ in range(3)), 0.0)
 
-    fitted = Coefficients(evidence(1), evidence(2), evidence(0.5), -1.0)
-    terms = len(PoseFeatures._fields) * 0.5 * (3 - 1) / 2
-    assert success_probability(evidence(3), fitted) == pytest.approx(1 / (1 + np.exp(1 - terms)))
-    assert 0 < success_probability(evidence(-1e9), fitted) < LIKELY
-    assert load_coefficients().bias == load_coefficients().bias  # the shipped file is whole
+    def probability(value: float) -> float:
+        return success_probability(PoseFeatures(*[value] * fields), Coefficients(unused, fitted))
+
+    terms = fields * 0.5 * (3 - 1) / 2
+    assert probability(3) == pytest.approx(1 / (1 + np.exp(1 - terms)))
+    assert 0 < probability(-1e9) < LIKELY
+    assert load_coefficients() == load_coefficients()  # the shipped file is whole
 
 
 def test_damaged_coefficients_are_named(tmp_path):

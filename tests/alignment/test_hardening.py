@@ -3,6 +3,7 @@
 Nothing here may give a traceback from inside, a silent identity, or a half-written file.
 """
 
+import os
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -73,6 +74,7 @@ MIRROR = np.diag([1.0, 1.0, -1.0, 1.0])
 BAD_ARGUMENTS = {
     "scale 0": ({"scale": 0.0}, r"scale must be 'auto' or a positive number; got 0"),
     "scale nan": ({"scale": np.nan}, r"scale must be 'auto' or a positive"),
+    "scale beyond float32": ({"scale": 1e90}, r"size from 1e-6 to 1e6.*Use 'auto'"),
     "scale word": ({"scale": "big"}, r"got 'big'"),
     "threshold 2": ({"overlap_threshold": 2.0}, r"overlap_threshold must be in \[0, 1\); got 2"),
     "threshold nan": ({"overlap_threshold": np.nan}, r"overlap_threshold must be in"),
@@ -102,8 +104,9 @@ def test_too_few_points_for_the_network_are_refused():
 def test_half_a_network_is_refused():
     from dbdnet_jax.alignment.align import align
 
+    half = tiny_params().replace(networks={"registration": tiny_params().registration})
     with pytest.raises(ValueError, match="params must hold both networks"):
-        align(SOURCE, TARGET, tiny_params().replace(overlap=None))
+        align(SOURCE, TARGET, half)
 
 
 LINE = np.linspace(-1, 1, 200)[:, None] * [1.0, 2.0, 0.5]
@@ -173,8 +176,30 @@ BAD_COMMANDS = {
     "clouds and a batch": (["a.ply", "a.ply", "--batch", "x"], "give two clouds, or --batch"),
     "nothing": ([], "give two clouds, or --batch"),
     "no such option": (["a.ply", "a.ply", "--refin3"], "unrecognized arguments: --refin3"),
-    "no number": (["a.ply", "a.ply", "--seed", "x"], "invalid int value: 'x'"),
-    "no scale": (["a.ply", "a.ply", "--scale", "x"], "invalid _scale value: 'x'"),
+    "no number": (["a.ply", "a.ply", "--seed", "x"], "--seed: must be a whole number from 0 to"),
+    "negative seed": (["a.ply", "a.ply", "--seed", "-1"], "4294967295; got '-1'"),
+    "threshold 1": (["a.ply", "a.ply", "--overlap-threshold", "1"], "from 0 to below 1; got '1'"),
+    "eight points": (["a.ply", "a.ply", "--max-points", "8"], "from 64 to 65536; got '8'"),
+    "huge scale": (["a.ply", "a.ply", "--scale", "1e300"], "from 1e-100 to 1e100; got '1e300'"),
+    "scale beyond float32": (
+        ["a.ply", "a.ply", "--scale", "1e90"],
+        "--scale must bring the clouds",
+    ),
+    "option that is no text": (["a.ply", "a.ply", "--\x1b[2J"], "arguments: --\\x1b[2J"),
+    "output is an input": (["a.ply", "b.ply", "--save-aligned", "half/../b.ply"], "is also b.ply"),
+    "output is a link to one": (
+        ["link.ply", "link.ply", "--save-aligned", "a.ply"],
+        "an output must not replace an input",
+    ),
+    "output is the guess": (
+        ["a.ply", "a.ply", "--initial", "three.txt", "-o", "three.txt"],
+        "is also three.txt",
+    ),
+    "output is the batch": (["--batch", "list/0001_a_a.txt", "-o", "list"], "is also list/0001"),
+    "no scale": (
+        ["a.ply", "a.ply", "--scale", "x"],
+        "auto, or a number from 1e-100 to 1e100; got 'x'",
+    ),
     "missing input": (["a.ply", "no.ply"], "a point file must exist; no.ply does not"),
     "bad input": (["a.ply", "tiny.npz"], "it must hold one array, or one named 'points'"),
     "bad weights": (["a.ply", "a.ply", "--params", "bad.npz"], "was not written by save_params"),
@@ -190,7 +215,10 @@ BAD_COMMANDS = {
     "no cloud to save": (["a.ply", "a.ply", "--save-aligned", "t.obj"], "must be one of .ply"),
     "empty batch": (["--batch", "empty.txt"], "must have at least one pair; empty.txt has none"),
     "batch of three": (["--batch", "three.txt"], "three.txt:1 must hold two paths; got 3"),
-    "batch unquoted": (["--batch", "quote.txt"], "No closing quotation"),
+    "batch unquoted": (
+        ["--batch", "quote.txt"],
+        "quote.txt:1 must hold two paths; got 2: No closing",
+    ),
     "no batch": (["--batch", "no.txt"], "no.txt"),
     "half a pair": (["--batch", "half"], "and one a_target.*; got 1 and 0. Rename"),
 }
@@ -206,6 +234,10 @@ def test_a_bad_command_is_status_2_and_one_line(tmp_path, monkeypatch, capsys, n
     Path("bad.npz").write_bytes(b"PK")
     Path("d.txt").mkdir()
     Path("half").mkdir()
+    Path("list").mkdir()
+    Path("list/0001_a_a.txt").write_text("../a.ply ../a.ply")
+    write_ply(Path("b.ply"), TARGET)
+    os.link("a.ply", "link.ply")
     write_ply(Path("half/a_source.ply"), SOURCE)
     before = sorted(Path().rglob("*"))
     arguments, message = BAD_COMMANDS[name]

@@ -1,55 +1,32 @@
-"""Rivals of a pose: how well turned clouds fit, and what counts as another pose."""
+"""Poses refined in a batch: each for itself, on as many points as there are."""
 
 import numpy as np
 import pytest
 
 from dbdnet_jax.alignment import search
-from dbdnet_jax.classical import refine as refine
-from tests.aligning import solid
+from dbdnet_jax.alignment.surfaces import surface
+from dbdnet_jax.alignment.transforms import angle_between, move
+from dbdnet_jax.classical import refine as em_icp
+from tests.aligning import motion, solid
 
 
-def table(count: int, seed: int) -> np.ndarray:
-    """(count, 3): a square plate on four legs, the same after every quarter of a turn."""
-    rng = np.random.default_rng(seed)
-    plate = np.column_stack([rng.uniform(-0.5, 0.5, (count // 2, 2)), np.zeros(count // 2)])
-    legs = rng.choice([-0.45, 0.45], (count - count // 2, 2))
-    return np.vstack([plate, np.column_stack([legs, rng.uniform(-0.6, 0.0, len(legs))])])
+@pytest.fixture(scope="module")
+def sides():
+    """Two samples of one shape, where they are."""
+    return surface(solid(380, 0)), surface(solid(380, 1))
 
 
-def test_a_square_table_has_rivals_a_quarter_and_half_a_turn_away():
-    alternative = search.strongest_alternative(np.eye(4), table(360, 0), table(360, 1))
-    assert abs(alternative.margin) < 0.1
-    assert alternative.angle_deg == pytest.approx(round(alternative.angle_deg / 90) * 90, abs=3)
-    assert abs(alternative.axis[2]) > 0.99
-    assert alternative.alternatives > 1.5
-
-
-def test_a_shape_without_symmetry_has_none_that_fits_as_well():
-    alternative = search.strongest_alternative(np.eye(4), solid(380, 0), solid(380, 1))
-    assert alternative.margin > 0.4
-    assert alternative.alternatives < 3
-
-
-def test_what_refining_would_make_of_a_pose_is_no_rival_of_it():
-    rough = np.eye(4)
-    turn = np.radians(20)
-    rough[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
-    source, target = solid(380, 0), solid(380, 1)
-    assert search.angle_between(search.refine(rough, source, target), np.eye(4))[0] < 3
-    alternative = search.strongest_alternative(rough, source, target)
-    assert search.angle_between(np.eye(4), rough)[0] > 15
-    assert alternative.margin > -0.1
-
-
-@pytest.mark.parametrize(("count", "scale"), [(60, 1.0), (60, 3.0), (380, 3.0)])
-def test_the_true_pose_fits_far_better_in_sparse_and_in_large_clouds_too(count, scale):
-    source, target = scale * solid(count, 0), scale * solid(count, 1)
-    own = search.truncated_rmse(np.eye(4), source, target)
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        turned = search.as_transform(rng.normal(size=(3, 3)), scale * rng.normal(size=3) * 0.1)
-        if search.angle_between(turned, np.eye(4))[0] > 30:
-            assert search.truncated_rmse(turned, source, target) > 1.25 * own
+@pytest.mark.parametrize("level", [search.COARSE, search.FINE], ids=["coarse", "fine"])
+def test_starts_are_refined_each_for_itself(sides, level):
+    starts = [motion(seed, 12.0, 0.05) for seed in range(level.batch + 1)]
+    found, residuals = search.refine_each(starts, *sides, level)
+    alone, residual = search.refine_each(starts[-1:], *sides, level)
+    assert len(found) == len(residuals) == len(starts)
+    np.testing.assert_allclose(found[-1], alone[0], atol=1e-5)
+    assert residuals[-1] == pytest.approx(residual[0], rel=1e-3)
+    errors = [angle_between(pose, np.eye(4))[0] for pose in found]
+    assert max(errors) < 5
+    assert np.linalg.norm(move(found[0], np.zeros(3))) < 0.05
 
 
 @pytest.mark.parametrize("count", [300, 1100, 5000])
@@ -57,10 +34,10 @@ def test_refining_takes_as_many_points_as_it_can(monkeypatch, count):
     seen = []
     monkeypatch.setattr(
         search,
-        "_run_polish",
-        lambda _, pose, *clouds: seen.extend(clouds) or (np.eye(3), np.ones(3)),
+        "_run_em_icp",
+        lambda pose, *clouds: seen.extend(clouds) or (np.eye(3), np.ones(3)),
     )
     search.refine(np.eye(4), solid(count, 0), solid(2 * count, 1))
     assert [len(points) for points in seen] == [
-        min(n, refine.MOST_POINTS) for n in (count, 2 * count)
+        min(n, em_icp.MOST_POINTS) for n in (count, 2 * count)
     ]

@@ -15,6 +15,7 @@ from dbdnet_jax.data.pairs import (
     initial_pose,
     make_pair,
     perturbed_overlap,
+    perturbed_pose,
     transform_source,
 )
 from dbdnet_jax.data.shapes import select
@@ -152,6 +153,14 @@ def test_the_packages_test_sets_are_the_published_ones(variant):
 def test_an_unknown_test_set_is_refused():
     with pytest.raises(ValueError, match="variant must be one of .*'noise'.*; got 'rain'"):
         cad_test_pairs("rain")
+
+
+def test_a_perturbed_pose_turns_about_the_middle_of_the_cloud(pairs):
+    pair = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), pairs)
+    for key in jax.random.split(jax.random.key(9), 4):
+        found = perturbed_pose(key, pair, max_angle_deg=60.0, shift_sigma=0.0)
+        ends = (rigid.apply(x, pair.source.points) for x in (found, pair.target_from_source))
+        np.testing.assert_allclose(*(jnp.mean(end, axis=0) for end in ends), atol=1e-5)
 
 
 def test_perturbed_overlap_is_now_true_now_everything_now_something_between(pairs):

@@ -173,12 +173,12 @@ def test_batches_are_read_ahead_but_not_without_end(folder, monkeypatch):
         return load_pair(*args, **kwargs)
 
     monkeypatch.setattr(threedmatch, "load_pair", count)
-    stream = batches(folder, info, batch_size=1, seed=0, points=32, read_ahead=2)
+    stream = batches(folder, info, batch_size=1, seed=0, points=32)
     next(stream)
     assert enough.wait(timeout=30)
     assert threading.main_thread() not in loaded
     stream.close()
-    assert len(loaded) <= 4
+    assert len(loaded) <= 2 + threedmatch.READ_AHEAD
 
 
 def test_error_while_reading_ahead_reaches_the_caller(folder):

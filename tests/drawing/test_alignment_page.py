@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -9,7 +10,7 @@ import sys
 import numpy as np
 import pytest
 
-for library in ("plotly", "matplotlib"):
+for library in ("plotly", "matplotlib", "jinja2"):
     pytest.importorskip(library, reason="the report extra is not installed")
 
 from matplotlib.image import imread  # noqa: E402
@@ -23,6 +24,14 @@ from dbdnet_jax.errors import MissingExtraError, require_drawing  # noqa: E402
 from tests.drawn import HOSTILE, SOURCE, TARGET, TRUE, Reader, by_hand  # noqa: E402
 
 NOWHERE = np.array([], int)
+# Asks every figure, once all are there, for the names and sizes of what it shows.
+ASK = b"""<script>
+setInterval(() => document.querySelectorAll('[data-drawn]').forEach((plot) => {
+  plot.dataset.traces = plot._fullData.filter((trace) => trace.visible === true)
+    .map((trace) => trace.name + ' ' + trace.x.length).join(', ');
+}), 100);
+</script>
+"""
 ODD = {
     "unsure": {"valid": False, "reason": "the pose is right with a probability of only 0.2"},
     "no matches": {"matches": Matches(NOWHERE, NOWHERE, np.array([]))},
@@ -36,6 +45,29 @@ def share_of(picture: np.ndarray, colour: str) -> float:
     """Part of a picture's pixels that have nearly this colour."""
     wanted = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255
     return float((np.abs(picture[..., :3] - wanted).max(axis=-1) < 0.05).mean())
+
+
+def coverage(picture: np.ndarray, colour: str) -> float:
+    """Area of a colour, per area of the picture; edges that fade into white count as they cover.
+
+    Mixing with white keeps the order of the channels and the ratio of their distances from white:
+    dots of one or two pixels have no pixel of exactly their colour in some browsers.
+    """
+    ink = 1 - np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+    missing = 1 - picture[..., :3]
+    part = missing @ ink / (ink @ ink)
+    pure = np.abs(missing - part[..., None] * ink).max(axis=-1) < 0.25 * part
+    return float(np.clip(part, 0, 1)[pure & (part > 0.2)].sum() / part.size)
+
+
+@pytest.mark.parametrize("faded", [1.0, 0.5])
+def test_coverage_counts_faded_dots_of_the_colour_only(faded):
+    orange, blue = (np.array(rgb) for rgb in ((0.902, 0.624, 0.0), (0.0, 0.447, 0.698)))
+    picture = np.ones((10, 10, 3))
+    picture[:2] = 1 - faded * (1 - orange)
+    picture[2:6] = 1 - faded * (1 - blue)
+    assert coverage(picture, style.SOURCE) == pytest.approx(0.2 * faded, rel=0.01)
+    assert coverage(picture, style.TARGET) == pytest.approx(0.4 * faded, rel=0.01)
 
 
 def test_a_page_holds_the_numbers_and_loads_nothing():
@@ -122,7 +154,7 @@ def test_a_large_cloud_is_thinned_and_the_page_says_so():
     assert f"19,000{drawn:,}" in text and "an even choice of a large one" in text
 
 
-@pytest.mark.parametrize("missing", ["plotly", "matplotlib"])
+@pytest.mark.parametrize("missing", ["plotly", "matplotlib", "jinja2"])
 def test_a_missing_library_is_named_with_what_to_install(missing, monkeypatch):
     monkeypatch.setitem(sys.modules, missing, None)
     with pytest.raises(MissingExtraError, match=rf"{missing}.*pip install \"dbdnet_jax\[report\]"):
@@ -136,7 +168,7 @@ def test_a_browser_draws_the_page_without_a_complaint(tmp_path):
         pytest.skip(f"no browser: none of {', '.join(names)} is installed")
     names = HOSTILE, HOSTILE
     page = alignment_page(by_hand(), SOURCE, TARGET, names=names, command=HOSTILE)
-    (tmp_path / "page.html").write_bytes(page)
+    (tmp_path / "page.html").write_bytes(page.replace(b"</body>", ASK + b"</body>"))
     done = subprocess.run(
         [
             browser, "--headless", "--no-sandbox", "--enable-unsafe-swiftshader",
@@ -144,11 +176,15 @@ def test_a_browser_draws_the_page_without_a_complaint(tmp_path):
             f"--user-data-dir={tmp_path}/profile", f"--screenshot={tmp_path}/page.png",
             "--dump-dom", (tmp_path / "page.html").as_uri(),
         ],
-        capture_output=True, text=True, timeout=120, env=os.environ | {"HOME": str(tmp_path)},
+        capture_output=True, text=True, timeout=300, env=os.environ | {"HOME": str(tmp_path)},
     )  # fmt: skip
     assert done.stdout.count('data-drawn="yes"') == 5
+    both = f"source {len(SOURCE)}, target {len(TARGET)}"
+    matched = "agrees with the pose 180"  # two ends and a gap for each of 60 lines
+    told = re.findall('data-traces="(.*?)"', done.stdout)
+    assert told == [both, both, both, f"{both}, {matched}", "inliers 8, farther 32"]
     said = [line for line in done.stderr.splitlines() if ":CONSOLE" in line]
     known = "GL Driver Message", "willReadFrequently"  # of drawing in software, and of speed
     assert not [line for line in said if not any(word in line for word in known)]
     picture = imread(tmp_path / "page.png")
-    assert share_of(picture, style.SOURCE) > 0.003 and share_of(picture, style.TARGET) > 0.003
+    assert coverage(picture, style.SOURCE) > 0.001 and coverage(picture, style.TARGET) > 0.001

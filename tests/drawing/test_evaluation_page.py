@@ -8,15 +8,10 @@ pytest.importorskip("plotly", reason="the report extra is not installed")
 
 from dbdnet_jax.classical import open3d as classical
 from dbdnet_jax.drawing.evaluation_page import evaluation_page, network_row
-from dbdnet_jax.evaluation.run import (
-    Evaluation,
-    Row,
-    constant_overlap,
-    evaluate_method,
-    from_points,
-)
+from dbdnet_jax.evaluation.methods import Method, Traits, from_points
+from dbdnet_jax.evaluation.run import Evaluation, Row, constant_overlap, evaluate_method
 from dbdnet_jax.ops import rigid
-from dbdnet_jax.types import Cloud, Pair, Rigid
+from dbdnet_jax.types import Answer, Cloud, Pair
 from tests.drawn import HOSTILE, Reader
 
 PAIRS, ROWS, COUNT = 5, 40, 32
@@ -36,17 +31,18 @@ def evaluation() -> Evaluation:
     pairs = Pair(Cloud(points, count), Cloud(target, count), motions, label, label, points, points)
     degrees = iter([9, 0, 4, 1, 2, 3])  # the first call is for compilation
 
-    def network(pair: Pair) -> Rigid:
+    def network(pair: Pair) -> Answer:
         angle = np.radians(next(degrees))
         turn = np.eye(3, dtype=np.float32)
         turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-        return Rigid(turn @ pair.target_from_source.rotation, pair.target_from_source.translation)
+        truth = pair.target_from_source
+        return Answer(truth._replace(rotation=turn @ truth.rotation))
 
     return Evaluation(
         rows=[
-            evaluate_method("identity", from_points(classical.identity), pairs),
-            Row("ICP", None, None, "install it"),
-            evaluate_method("DBDNet", network, pairs),
+            evaluate_method(Method("identity", from_points(classical.identity)), pairs),
+            Row("ICP", note="install it"),
+            evaluate_method(Method("DBDNet", network, Traits(learned=True)), pairs),
         ],
         constant_overlap=constant_overlap(pairs),
         pair_set="cad_test_noise",
@@ -95,5 +91,5 @@ def test_a_saved_sweep_is_drawn_and_a_damaged_one_named(evaluation, tmp_path):
 
 
 def test_without_figures_the_page_says_so(evaluation, tmp_path):
-    bare = evaluation._replace(rows=[Row("ICP", None, None, "install it")], test_pairs=None)
+    bare = evaluation._replace(rows=[Row("ICP", note="install it")], test_pairs=None)
     assert "No figures of the network." in Reader(evaluation_page(bare, tmp_path)).text

@@ -8,18 +8,18 @@ from configs import cad, threedmatch
 from dbdnet_jax.classical.open3d import identity
 from dbdnet_jax.data import test_pairs
 from dbdnet_jax.evaluation import sweep
-from dbdnet_jax.evaluation.run import from_points
+from dbdnet_jax.evaluation.methods import Method, Weights, from_points
 from dbdnet_jax.evaluation.sweep import SWEEPS, render_sweep, save_sweep
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.training.config import read_config
 
-NO_NETWORK = Params(None, None, read_config(cad.get_config()).model)
+NO_NETWORK = [Weights("", Params({}, read_config(cad.get_config()).model))]
 
 
 @pytest.fixture
 def config(monkeypatch):
     """The CAD config, with one cheap method on few pairs."""
-    monkeypatch.setattr(sweep, "make_methods", lambda *_: {"still": from_points(identity)})
+    monkeypatch.setattr(sweep, "make_methods", lambda *_: [Method("still", from_points(identity))])
     monkeypatch.setattr(test_pairs, "CAD_PAIRS", 4)
     return read_config(cad.get_config())
 

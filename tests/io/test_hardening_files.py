@@ -17,8 +17,9 @@ from ml_collections import ConfigDict
 from configs import cad
 from dbdnet_jax import from_released, load_params, load_pretrained, save_params
 from dbdnet_jax.alignment.writing import write_ply
-from dbdnet_jax.io.point_files import read_points, read_transform
-from dbdnet_jax.io.safe_pickle import CheckpointError
+from dbdnet_jax.errors import CheckpointError
+from dbdnet_jax.io.point_files import read_points
+from dbdnet_jax.io.transform_files import read_transform
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.training.config import read_config
 from tests.aligning import pair, tiny_params

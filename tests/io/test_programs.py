@@ -1,21 +1,28 @@
 """Clouds of any size go through a few compiled programs."""
 
+import os
+import subprocess
+import sys
+import zlib
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from dbdnet_jax.alignment import search
 from dbdnet_jax.classical.refine import Refined
 from dbdnet_jax.io import programs
+from dbdnet_jax.io.files import warn_without_cache
 from dbdnet_jax.ops.sampling import prefix_mask
 from dbdnet_jax.types import Branch, Registration, Rigid
 from tests.aligning import tiny_params
 from tests.conftest import random_cloud
 from tests.test_structure import imported_names
 
-NOT_TRACED = {"programs", "files", "safe_pickle", "quality"}
+NOT_TRACED = {"programs", "files", "forks", "surfaces", "transforms", "errors"}
+EXAMPLES = Path(__file__).parents[2] / "examples"
 BUCKETS = {192, 384, 768, 1536}
 
 
@@ -87,3 +94,117 @@ def test_two_functions_of_equal_arguments_are_two_programs(monkeypatch):
     monkeypatch.setattr(search, "_PROGRAMS", {})
     one, two = (search._run(f"add {k}", lambda x, k=k: x + k, jnp.ones(3)) for k in (1, 2))
     assert (two - one == 1).all()
+
+
+@pytest.fixture
+def keep_in():
+    """Tell JAX of another folder for programs, for one test."""
+    before = jax.config.values["jax_compilation_cache_dir"]
+    yield lambda folder: jax.config.update("jax_compilation_cache_dir", folder)
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+@pytest.fixture
+def kept(tmp_path, keep_in):
+    """A folder where programs are kept, and how often one was traced."""
+    keep_in(str(tmp_path))
+    traced = []
+
+    def double(x):
+        traced.append(1)
+        return 2 * x
+
+    def run():
+        answer = programs.load_or_trace(double, "double", jnp.ones(3))(jnp.ones(3))
+        assert (answer == 2).all()
+        return len(traced)
+
+    return tmp_path, run
+
+
+def entry(folder: Path) -> Path:
+    (path,) = folder.glob("*.stablehlo")
+    return path
+
+
+def test_a_kept_program_is_not_traced_again(kept):
+    folder, run = kept
+    assert run() == run() == 1 and entry(folder).is_file()
+
+
+@pytest.mark.parametrize("where", [0, 40, -1])
+def test_a_damaged_program_is_made_again(kept, where):
+    folder, run = kept
+    run()
+    whole = entry(folder).read_bytes()
+    flipped = bytearray(whole)
+    flipped[where] ^= 1
+    for times, damaged in enumerate((bytes(flipped), b"", whole[:-9], b"x" * 99, whole + b"x"), 2):
+        entry(folder).write_bytes(damaged)
+        assert run() == times
+        assert run() == times  # kept again
+
+
+def test_a_folder_in_place_of_a_program_and_a_full_disk_cost_a_warning(kept, keep_in):
+    folder, run = kept
+    run()
+    path = entry(folder)
+    path.unlink()
+    path.mkdir()
+    warn_without_cache.cache_clear()
+    with pytest.warns(RuntimeWarning, match="nothing is kept for the next run"):
+        assert run() == 2
+    keep_in("/dev/null/below")
+    warn_without_cache.cache_clear()
+    with pytest.warns(RuntimeWarning, match="nothing is kept"):
+        assert run() == 3
+
+
+def test_another_precision_is_another_program(kept):
+    folder, run = kept
+    run()
+    with jax.enable_x64(True):
+        run()
+    with jax.default_matmul_precision("highest"):
+        run()
+    assert len(list(folder.glob("*.stablehlo"))) == 3
+
+
+def test_the_time_of_loading_is_known(kept):
+    before = programs.loading_seconds()
+    kept[1]()
+    assert programs.loading_seconds() > before
+
+
+def test_entries_of_jax_that_are_not_whole_are_deleted(tmp_path):
+    whole = zlib.compress(bytes(range(256)) * 9)
+    held = {"whole": whole, "empty": b"", "half": whole[:-3], "odd": b"odd", "long": whole + b"x"}
+    held["flipped"] = whole[:20] + bytes([whole[20] ^ 1]) + whole[21:]
+    held["zstandard"] = b"\x28\xb5\x2f\xfd?"
+    for name, data in held.items():
+        (tmp_path / f"{name}-cache").write_bytes(data)
+    programs._drop_damaged(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"whole-cache", "zstandard-cache"}
+
+
+@pytest.mark.parametrize("given", [None, "/dev/null/below"])
+def test_no_folder_for_programs_is_said_and_none_is_used(given, keep_in, monkeypatch):
+    keep_in(given)
+    monkeypatch.setenv("XDG_CACHE_HOME", "/dev/null")
+    shortest = jax.config.values["jax_persistent_cache_min_compile_time_secs"]
+    warn_without_cache.cache_clear()
+    with pytest.warns(RuntimeWarning, match="nothing is kept for the next run"):
+        programs.keep_compiled_programs()
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", shortest)
+    assert jax.config.values["jax_compilation_cache_dir"] is None
+
+
+def test_a_platform_that_is_not_there_is_one_line():
+    done = subprocess.run(
+        [sys.executable, "-m", "dbdnet_jax", *map(str, EXAMPLES.glob("*.ply"))],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"JAX_PLATFORMS": "cuda"},
+    )
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert "error: JAX_PLATFORMS must name platforms that this machine has; got" in done.stderr

@@ -10,7 +10,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from dbdnet_jax.io.safe_pickle import CheckpointError
+from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.io.torch_pickle import load_pickle, load_torch
 from tests.torch_files import MAGIC, Touches, write
 
@@ -116,7 +116,7 @@ def test_other_names_are_refused(tmp_path, name):
             b"(Vstorage\nVf4\nV0\nVcpu\nI-1\ntQ.",
             "size of a storage must be at most 32 whole numbers from 0",
         ),
-        (b"]" * 100000 + b"a" * 99999 + b".", "damaged"),
+        (b"]" * 100000 + b"a" * 99999 + b".", "at most 200 levels"),
     ],
 )
 def test_crafted_pickles_are_refused(tmp_path, data, message):
@@ -145,7 +145,9 @@ def test_repeated_copies_do_not_multiply_the_file(tmp_path, function, argument):
     path = write(tmp_path / "x.pkl", data)
     tracemalloc.start()
     try:
-        with pytest.raises(CheckpointError, match="copies more than it contains"):
+        with pytest.raises(
+            CheckpointError, match="copies more than it contains|64 parts for each opcode"
+        ):
             load_pickle(path)
         # Python's objects take tens of bytes for each of the file's; 10,000 copies would not fit.
         assert tracemalloc.get_traced_memory()[1] < 100 * len(data)

@@ -130,7 +130,7 @@ def test_summary_against_numpy_on_known_errors():
     }
     for name, value in expected.items():
         assert_close(getattr(summary, name), np.asarray(value), DEGREES)
-    assert (summary.pairs, summary.non_finite, summary.overlap) == (4, 0, None)
+    assert (summary.pairs, summary.non_finite) == (4, 0)
 
 
 @pytest.mark.parametrize("broken", ["rotation", "translation"])
@@ -202,12 +202,27 @@ def answer_and_pair(seed: int) -> tuple[Registration, Pair]:
     return answer, Pair(*clouds, truth, *labels, clouds[0].points, clouds[1].points)
 
 
-def test_registration_errors_under_jit_and_vmap_are_those_of_a_loop():
+def errors_and_counts(answer: Registration, pair: Pair):
+    return (
+        metrics.motion_errors(answer.motion, pair.target_from_source),
+        metrics.pair_confusion(answer.src_overlap, answer.tgt_overlap, pair),
+    )
+
+
+def test_errors_under_jit_and_vmap_are_those_of_a_loop():
     answers, pairs = zip(*(answer_and_pair(seed) for seed in range(4)), strict=True)
-    loop = [metrics.registration_errors(*each) for each in zip(answers, pairs, strict=True)]
-    together = jax.jit(jax.vmap(metrics.registration_errors))(stack(answers), stack(pairs))
+    loop = [errors_and_counts(*each) for each in zip(answers, pairs, strict=True)]
+    together = jax.jit(jax.vmap(errors_and_counts))(stack(answers), stack(pairs))
     jax.tree.map(lambda a, b: assert_close(a, b, DEGREES), together, stack(loop))
-    assert sum(int(np.sum(count)) for count in together.overlap) == 4 * (5 + 3)
+    counts = together[1]
+    assert sum(int(np.sum(count)) for count in counts) == 4 * (5 + 3)
+    wrong = counts.false_positive + counts.false_negative
+    assert_close(metrics.overlap_error(counts), wrong / 8, FLOAT32)
+    assert_close(
+        metrics.overlap_f1(counts),
+        2 * counts.true_positive / (2 * counts.true_positive + wrong),
+        FLOAT32,
+    )
     hits = sum(
         int(np.sum((np.asarray(p) > 0.5)[:n] & np.asarray(label)[:n]))
         for answer, pair in zip(answers, pairs, strict=True)
@@ -216,13 +231,13 @@ def test_registration_errors_under_jit_and_vmap_are_those_of_a_loop():
             (answer.tgt_overlap, pair.target_overlap, 3),
         )
     )
-    assert int(np.sum(together.overlap.true_positive)) == hits
+    assert int(np.sum(counts.true_positive)) == hits
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_point_distance_against_a_search_tree(seed):
     answer, pair = answer_and_pair(seed)
-    predicted = Rigid(answer.rotation, answer.translation)
+    predicted = answer.motion
     source, target = np.asarray(pair.source.points[:5]), np.asarray(pair.target.points[:3])
     true, moved = (
         source @ np.asarray(motion.rotation).T + np.asarray(motion.translation)

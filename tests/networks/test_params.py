@@ -6,17 +6,13 @@ import numpy as np
 import pytest
 from flax.traverse_util import flatten_dict
 
-from dbdnet_jax.io.safe_pickle import CheckpointError
+from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.dbdnet.overlap import OverlapNetwork
 from dbdnet_jax.networks.dbdnet.registration import RegistrationNetwork
-from dbdnet_jax.networks.params import (
-    flatten,
-    init_params,
-    parameter_shapes,
-    require_shapes,
-    unflatten,
-)
+from dbdnet_jax.networks.initial import init_params
+from dbdnet_jax.networks.params import flatten, require_shapes, unflatten
+from dbdnet_jax.networks.table import parameter_shapes
 from dbdnet_jax.ops.pyramid import build_pyramids
 from dbdnet_jax.types import Cloud
 

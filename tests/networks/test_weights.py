@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from dbdnet_jax.networks import weights
-from dbdnet_jax.networks.dbdnet.config import ModelConfig
-from dbdnet_jax.networks.params import parameter_shapes, unflatten
-from dbdnet_jax.networks.weights import CheckpointError, load_metadata, load_params, save_params
+from dbdnet_jax.networks.dbdnet.config import ModelConfig, check_field
+from dbdnet_jax.networks.params import unflatten
+from dbdnet_jax.networks.table import parameter_shapes
+from dbdnet_jax.networks.weights import CheckpointError, load_params, save_params
 from tests.torch_files import save_zip, tensor
 
 CONFIG = ModelConfig(
@@ -72,11 +73,11 @@ def test_the_round_trip_is_exact(tmp_path, networks):
     loaded = load_params(tmp_path / "w.npz")
     assert same(loaded, params) and loaded.config == CONFIG
     assert all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(loaded))
-    assert load_metadata(tmp_path / "w.npz") == {}
 
 
-def test_metadata_comes_back(path):
-    assert load_metadata(path) == {"data": "CAD", "steps": 3}
+def test_metadata_stands_in_the_header(path):
+    header = json.loads(str(members(path)["header"]))
+    assert header["metadata"] == {"data": "CAD", "steps": 3}
 
 
 def test_the_same_weights_give_the_same_file(path, tmp_path):
@@ -151,7 +152,7 @@ def test_what_could_not_be_loaded_is_not_saved(tmp_path):
     with pytest.raises(CheckpointError, match="misshapen"):
         save_params(tmp_path / "w.npz", params.replace(config=ModelConfig()))
     with pytest.raises(CheckpointError, match="no array"):
-        save_params(tmp_path / "w.npz", params.replace(overlap=None, registration=None))
+        save_params(tmp_path / "w.npz", params.replace(networks={}))
     with pytest.raises(FileNotFoundError, match="absent does not. Create it"):
         save_params(tmp_path / "absent" / "w.npz", params)
     assert not list(tmp_path.iterdir())
@@ -202,3 +203,75 @@ def test_pretrained_weights_go_by_name(path, tmp_path, monkeypatch):
     monkeypatch.setattr(weights, "PRETRAINED", tmp_path / "absent")
     with pytest.raises(CheckpointError, match=r"\(none\); got 'cad'"):
         weights.load_pretrained()
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("overlap_blocks", 10**9),
+        ("overlap_blocks", -1),
+        ("heads", 0),
+        ("heads", True),
+        ("neighbours", 16.5),
+        ("neighbours", float("nan")),
+        ("overlap_threshold", float("nan")),
+        ("overlap_threshold", float("inf")),
+        ("dropout", "0.1"),
+        ("overlap_channels", [4]),
+        ("neighbour_space", None),
+        ("released", 1),
+        ("parameter_width", 2**40),
+    ],
+)
+def test_a_header_of_wrong_types_or_out_of_bounds_is_refused(path, field, value):
+    rewrite_header(path, model=dataclasses.asdict(CONFIG) | {field: value})
+    with pytest.raises(CheckpointError, match=f"(?s)cannot be built: .*{field}"):
+        load_params(path)
+    # The tests' own checks of types come before those of the record.
+    with pytest.raises(ValueError, match=f"{field} must be .*; got .* Use "):
+        check_field(field, value, type(getattr(ModelConfig, field)))
+
+
+@pytest.mark.parametrize(
+    "header",
+    ["[]", "3", "null", "{}", "{", "[" * 100_000, '{"format": 1}', '{"format": [1]}']
+    + [f'{{"format": 1, "metadata": {{}}, "model": {x}}}' for x in ("null", "[]", '"x"', "3")]
+    + ['{"format": 1, "model": {}, "metadata": 3}'],
+)
+def test_a_header_that_is_none_is_refused(path, header):
+    rewrite(path, members(path) | {"header": np.array(header)}, valid=True)
+    with pytest.raises(CheckpointError, match=r"w\.npz: the (header|format) must"):
+        load_params(path)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300])
+def test_numbers_that_are_not_finite_are_neither_saved_nor_loaded(path, value):
+    name = "overlap/linear/bias"
+    content = members(path)
+    content[name] = np.full_like(content[name], value, dtype=np.float64)
+    rewrite(path, content, valid=True)
+    with pytest.raises(CheckpointError, match=f"must hold finite numbers; .* 1 of .*: {name}"):
+        load_params(path)
+    params = make()
+    params.overlap["linear"]["bias"] = np.full(1, value)
+    with pytest.raises(CheckpointError, match="must hold finite numbers"):
+        save_params(path, params)
+
+
+def test_an_archive_that_unpacks_to_more_than_it_is_is_refused(tmp_path):
+    np.savez_compressed(tmp_path / "w.npz", header=np.zeros(10**6), sha256=np.array("x"))
+    with pytest.raises(CheckpointError, match="must be stored uncompressed"):
+        load_params(tmp_path / "w.npz")
+    np.savez(tmp_path / "w.npz", header=np.zeros(10), sha256=np.array("x"))
+    data = (tmp_path / "w.npz").read_bytes()
+    (tmp_path / "w.npz").write_bytes(data.replace(b"(10,), ", b"(9999,)"))
+    with pytest.raises(CheckpointError, match="was not written by save_params"):
+        load_params(tmp_path / "w.npz")
+
+
+def test_arrays_of_another_byte_order_are_read(path):
+    content = members(path)
+    for name in [name for name in content if "/" in name]:
+        content[name] = content[name].astype(">f4")
+    rewrite(path, content, valid=True)
+    assert same(load_params(path), make())

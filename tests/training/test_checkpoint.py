@@ -8,10 +8,10 @@ import numpy as np
 import optax
 import pytest
 
-from dbdnet_jax.io.safe_pickle import CheckpointError
+from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.training.checkpoint import Checkpoints, load_best, write_stage
-from dbdnet_jax.training.loop import init_state
+from dbdnet_jax.training.step import init_state
 from tests.conftest import EXACT, assert_close
 
 OPTIMIZER = optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(lambda step: 1e-3 / (step + 1)))

@@ -10,14 +10,15 @@ import pytest
 
 from configs import cad
 from dbdnet_jax.data.training_pairs import PairStream, pairs_of_shapes
-from dbdnet_jax.io.safe_pickle import CheckpointError
+from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import save_params
 from dbdnet_jax.training.checkpoint import Checkpoints, load_best, write_stage
-from dbdnet_jax.training.config import RunConfig, read_config, stage_record
-from dbdnet_jax.training.dbdnet import make_task
+from dbdnet_jax.training.config import read_config, stage_record
 from dbdnet_jax.training.loop import fit
 from dbdnet_jax.training.losses import JointTerms
+from dbdnet_jax.training.table import STAGES
+from dbdnet_jax.training.task import RunConfig, Task
 from tests import stand_in
 from tests.conftest import EXACT, Tolerance, assert_close, assert_finite
 
@@ -48,6 +49,10 @@ def config() -> RunConfig:
 
 
 CONFIG = config()
+
+
+def make_task(config: RunConfig, stage: str, run_dir) -> Task:
+    return STAGES["dbdnet"][stage].make_task(config, run_dir)
 
 
 def source() -> PairStream:
@@ -110,12 +115,10 @@ def test_networks_of_several_passes_go_on_from_weights(run_dir, tmp_path, stage)
     config = dataclasses.replace(
         CONFIG,
         model=dataclasses.replace(CONFIG.model, overlap_passes=2, iterations=2),
-        train=dataclasses.replace(CONFIG.train, start=str(weights), learning_rate=1e-5),
-        overlap=dataclasses.replace(CONFIG.overlap, learning_rate=1e-5),
-        registration=dataclasses.replace(
-            CONFIG.registration, learning_rate=1e-5, masks="perturbed"
-        ),
+        train=dataclasses.replace(CONFIG.train, start=str(weights)),
     )
+    config = config.with_stage("overlap", learning_rate=1e-5)
+    config = config.with_stage("registration", learning_rate=1e-5, masks="perturbed")
     fit(config, stage, tmp_path, source())
     found, start = (getattr(load_best(folder), stage) for folder in (tmp_path, run_dir))
     jax.tree.map(lambda a, b: assert_close(a, b, Tolerance(rtol=0.0, atol=1e-3)), found, start)
@@ -166,7 +169,7 @@ def test_the_joint_stage_trains_both_networks_further(run_dir, tmp_path):
     fit(config, "joint", tmp_path / "run", pairs)
     start = load_best(run_dir)
     with Checkpoints(tmp_path / "run" / "joint") as checkpoints:
-        found = Params(**checkpoints.restore_weights(6), config=config.model)
+        found = Params(checkpoints.restore_weights(6), config.model)
     for before, after in ((start.overlap, found.overlap), (start.registration, found.registration)):
         moved = jax.tree.leaves(jax.tree.map(lambda a, b: bool((a != b).any()), before, after))
         assert np.mean(moved) > 0.9
@@ -222,7 +225,8 @@ def test_the_frozen_network_of_registration_is_never_the_joint_one(run_dir, tmp_
 
 def test_the_joint_stage_needs_both_networks(run_dir, tmp_path):
     weights = tmp_path / "weights.npz"
-    save_params(weights, dataclasses.replace(load_best(run_dir), registration=None))
+    params = load_best(run_dir)
+    save_params(weights, params.replace(networks={"overlap": params.overlap}))
     train = dataclasses.replace(CONFIG.train, start=str(weights))
     with pytest.raises(CheckpointError, match=r"weights\.npz does not hold both. Train them in"):
         fit(dataclasses.replace(CONFIG, train=train), "joint", tmp_path, source())

@@ -14,10 +14,10 @@ import optax
 import pytest
 
 from dbdnet_jax.training.checkpoint import Checkpoints
-from dbdnet_jax.training.loop import init_state, train_step
 from dbdnet_jax.training.optimizer import make_optimizer, make_schedule
 from dbdnet_jax.training.parallel import mean_over_pairs, on_all_devices
 from dbdnet_jax.training.runlog import RunLog
+from dbdnet_jax.training.step import init_state, train_step
 from tests import stand_in
 from tests.conftest import EXACT, FLOAT32, assert_close, assert_finite
 
@@ -284,3 +284,16 @@ def test_the_log_drops_what_is_done_again_and_torn_rows(tmp_path):
         assert not (tmp_path / "validation.csv").exists()
         log.write("train", 30, {"loss": 1 / 30, "rate": 0.1})
     assert (tmp_path / "train.csv").read_text() == whole
+
+
+def test_the_rate_may_stay_until_the_last_steps():
+    def schedule(steps, decay=20):
+        return make_schedule(0.5, steps, 9, kind="constant", decay_steps=decay)
+
+    rates = [float(schedule(100)(step)) for step in range(101)]
+    np.testing.assert_allclose(rates[:10], 0.05 * np.arange(1, 11), rtol=1e-6)
+    np.testing.assert_allclose(rates[9:81], 0.5, rtol=1e-6)
+    assert np.all(np.diff(rates[80:]) < 0) and rates[100] < 1e-6
+    # More steps change nothing of those before the decay.
+    assert [float(schedule(500)(step)) for step in range(80)] == rates[:80]
+    assert float(schedule(100, 0)(100)) == 0.5

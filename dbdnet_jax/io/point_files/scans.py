@@ -30,8 +30,8 @@ def read_las(file: BinaryIO, path: Path, seed: int) -> PointFile:
         _load("lazrs", "LAZ")
     with laspy.open(file, closefd=False) as reader:
         header = reader.header
-        size = header.point_format.size
         room = path.stat().st_size - header.offset_to_point_data
+        size = header.point_format.size
         if not header.are_points_compressed and room < header.point_count * size:
             raise FileFault(
                 f"it promises {header.point_count} points and has bytes for "

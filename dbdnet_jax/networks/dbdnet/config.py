@@ -1,8 +1,33 @@
 """The numbers that fix the architecture: they travel with the parameters."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
-Layers = tuple[tuple[int, int], ...]  # (features, groups of the norm) of each layer
+from dbdnet_jax.networks.blocks import Layers
+from dbdnet_jax.ops.local_geometry import FEATURES, RADII
+
+# What a field may be, both ends included. The upper ends are far above what has been of use and
+# below what takes a machine: a file's header may ask for anything.
+_BOUNDS: dict[str, tuple[float, float]] = {
+    "overlap_channels": (4, 1024),  # 16 times the paper's: weights of ten gigabytes
+    "overlap_blocks": (0, 64),  # the paper's is 4; every block is traced and compiled on its own
+    "registration_channels": (4, 1024),
+    "shared_blocks": (0, 64),
+    "rotation_blocks": (0, 64),
+    "translation_blocks": (0, 64),
+    "heads": (1, 4096),  # one for each channel of the widest feature
+    "dropout": (0.0, 0.99),  # at 1 nothing would be left to learn from
+    "head_width": (128, 8192),
+    "parameter_width": (128, 8192),
+    "neighbours": (1, 1024),  # every point keeps an array of so many
+    "overlap_passes": (1, 64),  # each is traced and compiled on its own
+    "overlap_points": (0, 2**20),  # the matches of so many are a matrix of 4 terabytes
+    "registration_points": (0, 2**20),
+    "local_geometry": (0, len(RADII)),
+    "overlap_threshold": (0.0, 1.0),
+    "min_points": (1, 2**20),
+    "iterations": (1, 64),
+    "sinkhorn_iterations": (1, 1024),
+}
 
 
 @dataclass(frozen=True)
@@ -29,6 +54,7 @@ class ModelConfig:
     overlap_passes: int = 1  # more: again over the clouds as the last one's answer aligns them
     overlap_points: int = 0  # that the overlap network sees, farthest first; 0: all
     registration_points: int = 0  # of the selected ones, that are matched; 0: all
+    local_geometry: int = 0  # radii at which the encoders see the surface around a point
     overlap_threshold: float = 0.5
     min_points: int = 160  # the most probable rows kept when fewer pass the threshold
     iterations: int = 1
@@ -36,15 +62,25 @@ class ModelConfig:
     released: bool = False
 
     def __post_init__(self):
-        """Refuse what cannot be built."""
+        """Refuse what cannot be built: types and bounds first, then what must fit together.
+
+        Raises:
+          ValueError: names the field, the rule and the value.
+        """
+        for field in fields(self):
+            check_field(field.name, getattr(self, field.name), type(field.default))
         if self.neighbour_space not in ("feature", "coordinates"):
             raise ValueError(
                 "neighbour_space must be 'feature' or 'coordinates'; "
                 f"got {self.neighbour_space!r}. Use one of the two."
             )
+        self._check_widths()
+        self._check_combinations()
+
+    def _check_widths(self):
         for name in ("overlap_channels", "registration_channels"):
             channels = getattr(self, name)
-            if channels < 4 or channels % 4:
+            if channels % 4:
                 raise ValueError(
                     f"{name} must be a positive multiple of 4 (its group norms have 4 groups); "
                     f"got {channels}. Use {max(4, round(channels / 4) * 4)}."
@@ -55,36 +91,43 @@ class ModelConfig:
                     "Change one of the two."
                 )
         for name in ("head_width", "parameter_width"):
-            if getattr(self, name) < 128 or getattr(self, name) % 128:
+            if getattr(self, name) % 128:
                 raise ValueError(
                     f"{name} must be a positive multiple of 128 (its layers halve it, and their "
                     f"group norms have up to 16 groups); got {getattr(self, name)}. Use 128."
                 )
+
+    def _check_combinations(self):
         if self.overlap_passes > 1 and not self.overlap_matching:
             raise ValueError(
                 "overlap_passes must be 1 without overlap_matching, whose matches give the motion "
                 "between passes while the overlap network is trained alone; got "
                 f"{self.overlap_passes}. Set overlap_matching=True."
             )
-        counts = ("overlap_passes", "iterations", "sinkhorn_iterations", "neighbours", "min_points")
-        for name in (*counts, "heads"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} must be at least 1; got {getattr(self, name)}.")
         for name in ("overlap_points", "registration_points"):
             points = getattr(self, name)
-            if points < 0 or (points and self.released):
+            if points and self.released:
                 raise ValueError(
                     f"{name} must be 0 (all points) or positive, and 0 where released=True (the "
                     f"released network has no such limit); got {points}, released="
                     f"{self.released}. Use 0."
                 )
+        if not 0 <= self.local_geometry <= len(RADII) or (self.local_geometry and self.released):
+            raise ValueError(
+                f"local_geometry must be from 0 to {len(RADII)} radii, and 0 where released=True "
+                f"(the released network has no such input); got {self.local_geometry}, released="
+                f"{self.released}. Use 0."
+            )
         if self.overlap_matching and self.released:
             raise ValueError(
                 "overlap_matching must be False where released=True: the released network has no "
                 "such part; got True. Set one of the two to False."
             )
-        if not 0.0 <= self.dropout < 1.0:
-            raise ValueError(f"dropout must be in [0, 1); got {self.dropout}.")
+
+    @property
+    def inputs(self) -> int:
+        """What an encoder is given of each point: coordinates and local geometry."""
+        return 3 + FEATURES * self.local_geometry
 
     @property
     def solves(self) -> int:
@@ -107,3 +150,20 @@ class ModelConfig:
         """The parameter network's layers after its maximum."""
         width = self.parameter_width
         return (width // 2, 16), (width // 4, 16), (width // 8, 8)
+
+
+def check_field(name: str, value: object, kind: type) -> None:
+    """Refuse a value of another type than its field's, and a number out of bounds, NaN included."""
+    accepted = (int, float) if kind is float else kind
+    if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
+        raise ValueError(
+            f"{name} must be of type {kind.__name__}; got {value!r:.60} "
+            f"({type(value).__name__}). Use {getattr(ModelConfig, name)!r}."
+        )
+    if name in _BOUNDS:
+        low, high = _BOUNDS[name]
+        if not low <= value <= high:  # type: ignore[operator]  # a number, by its type
+            raise ValueError(
+                f"{name} must be from {low} to {high}; got {value!r:.60}. Use "
+                f"{getattr(ModelConfig, name)}."
+            )

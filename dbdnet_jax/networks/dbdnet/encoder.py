@@ -5,8 +5,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from dbdnet_jax.networks.blocks import Exchange
-from dbdnet_jax.networks.edgeconv import EdgeConv
+from dbdnet_jax.networks.blocks import Exchange, exchange_shapes
+from dbdnet_jax.networks.edgeconv import EdgeConv, edgeconv_shapes
+from dbdnet_jax.networks.params import Shapes
 from dbdnet_jax.ops.grouping import knn
 from dbdnet_jax.ops.pyramid import LEVELS, Pyramid, query_down
 
@@ -24,13 +25,23 @@ class Encoder(nn.Module):
     neighbour_space: str
 
     @nn.compact
-    def __call__(self, points: Float[Array, "n 3"], pyramid: Pyramid) -> Float[Array, "n d"]:
-        """Encode one cloud in farthest-point order; the pyramid may be of the cloud at rest."""
+    def __call__(
+        self,
+        points: Float[Array, "n 3"],
+        pyramid: Pyramid,
+        geometry: Float[Array, "n g"] | None = None,
+    ) -> Float[Array, "n d"]:
+        """Encode one cloud in farthest-point order; the pyramid may be of the cloud at rest.
+
+        ``geometry`` holds what else is known of each point (`ops.local_geometry`).
+        """
         history: list[list[jax.Array]] = [[] for _ in range(LEVELS)]
-        features = [points]
+        features = [points if geometry is None else jnp.concatenate([points, geometry], axis=-1)]
         for stage in range(1, LEVELS + 1):
             features = [
-                self._edgeconv(f"stage{stage}_conv{level + 1}", x, pyramid, level)
+                self._edgeconv(
+                    f"stage{stage}_conv{level + 1}", x, pyramid, level, points if stage == 1 else x
+                )
                 for level, x in enumerate(features)
             ]
             for level, x in enumerate(features):
@@ -53,11 +64,14 @@ class Encoder(nn.Module):
     def _width(self, level: int) -> int:
         return self.channels << level
 
-    def _edgeconv(self, name: str, x: jax.Array, pyramid: Pyramid, level: int) -> jax.Array:
+    def _edgeconv(
+        self, name: str, x: jax.Array, pyramid: Pyramid, level: int, place: jax.Array
+    ) -> jax.Array:
+        """EdgeConv over rows near in ``place``: coordinates in the first stage, then features."""
         here = pyramid.levels[level]
         index = here.neighbours
         if self.neighbour_space == "feature":
-            index = knn(x, x, index.shape[1], here.count)
+            index = knn(place, place, index.shape[1], here.count)
         return EdgeConv(self._width(level), GROUPS[level], name=name)(x, index, here.valid)
 
     def _exchange(self, stage: str, features: list[jax.Array], pyramid: Pyramid) -> list:
@@ -81,3 +95,25 @@ class Encoder(nn.Module):
                     parts.append(move.down(query_down(x, pyramid, other, level)))
             result.append(sum(parts[1:], parts[0]))
         return result
+
+
+def encoder_shapes(name: str, channels: int, inputs: int) -> Shapes:
+    """The parameters of an `Encoder` that is given so many numbers of each point."""
+    widths = [channels << level for level in range(LEVELS)]
+    shapes: Shapes = {}
+    for stage in range(1, LEVELS + 1):
+        for level, width in enumerate(widths[:stage]):
+            fan_in = width if stage > 1 else inputs
+            shapes |= edgeconv_shapes(f"{name}/stage{stage}_conv{level + 1}", fan_in, width)
+        for level, width in enumerate(widths[: stage + 1]):
+            for other, fan_in in enumerate(widths[:stage]):
+                if other != level:
+                    move = f"{'up' if other > level else 'down'}_{other + 1}_{level + 1}"
+                    shapes |= exchange_shapes(f"{name}/stage{stage}_{move}", fan_in, width)
+    for level, width in enumerate(widths):
+        # What is fused: the level's output of every stage that holds it and the last exchange's.
+        fused = (LEVELS + 1 - level) * width
+        shapes |= exchange_shapes(f"{name}/fusion_{level + 1}", fused, width)
+        if level:
+            shapes |= exchange_shapes(f"{name}/neck_{level + 1}", width, channels)
+    return shapes

@@ -6,9 +6,12 @@ from jaxtyping import Array, Float, Int
 
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.ops import rigid
+from dbdnet_jax.ops.local_geometry import local_geometry
 from dbdnet_jax.ops.rigid import HIGHEST
-from dbdnet_jax.ops.sampling import farthest_order, inverse_order, prefix_mask, prefix_order
+from dbdnet_jax.ops.sampling import farthest_order, inverse_order, prefix_order
 from dbdnet_jax.types import Cloud, Rigid
+
+FEWEST_ROWS = 8  # of a stack: the coarsest of four levels has one row
 
 
 def pad_rows(x: jax.Array, size: int) -> jax.Array:
@@ -18,7 +21,7 @@ def pad_rows(x: jax.Array, size: int) -> jax.Array:
 
 def stack_clouds(source: Cloud, target: Cloud) -> Cloud:
     """Two clouds of any static sizes as one stack; padding, as everywhere, changes nothing."""
-    size = max(source.points.shape[0], target.points.shape[0])
+    size = max(source.points.shape[0], target.points.shape[0], FEWEST_ROWS)
     points = jnp.stack([pad_rows(source.points, size), pad_rows(target.points, size)])
     points = points.astype(jnp.promote_types(points.dtype, jnp.float32))
     return Cloud(points, jnp.stack([jnp.asarray(source.count), jnp.asarray(target.count)]))
@@ -26,7 +29,7 @@ def stack_clouds(source: Cloud, target: Cloud) -> Cloud:
 
 def stack_masked(src, tgt, src_mask, tgt_mask) -> tuple[Cloud, Int[Array, "2 n"]]:
     """Stack two clouds with masks; ``order[c, row]`` is the caller's row of a stacked row."""
-    size = max(src.shape[0], tgt.shape[0])
+    size = max(src.shape[0], tgt.shape[0], FEWEST_ROWS)
     masks = [
         pad_rows(jnp.ones(x.shape[0], bool) if mask is None else mask, size)
         for x, mask in ((src, src_mask), (tgt, tgt_mask))
@@ -38,6 +41,27 @@ def stack_masked(src, tgt, src_mask, tgt_mask) -> tuple[Cloud, Int[Array, "2 n"]
     return Cloud(points, jnp.sum(keep, axis=1)), order
 
 
+def geometry_of(clouds: Cloud, config: ModelConfig) -> Float[Array, "2 n g"] | None:
+    """`ops.local_geometry` of both clouds, from all of their points; None where none is seen.
+
+    No rigid motion changes it: found once, it serves every turn and every start.
+    """
+    if not config.local_geometry:
+        return None
+    return jax.lax.map(
+        lambda one: local_geometry(one.points, one.count, config.local_geometry), clouds
+    )
+
+
+def reordered(
+    geometry: Float[Array, "2 n g"] | None, order: Int[Array, "2 m"]
+) -> Float[Array, "2 m g"] | None:
+    """The rows of ``geometry`` that ``order`` names for each cloud."""
+    if geometry is None:
+        return None
+    return jnp.take_along_axis(geometry, order[..., None], axis=1)
+
+
 def centre_and_order(clouds: Cloud, config: ModelConfig, limit: int):
     """Centre both clouds and bring them into farthest-point order.
 
@@ -46,8 +70,7 @@ def centre_and_order(clouds: Cloud, config: ModelConfig, limit: int):
     Returns the clouds, the order, the released code's rows for query-down, and the centroids.
     What stands in the padding is overwritten, so that it cannot matter from here on.
     """
-    size = clouds.points.shape[1]
-    valid = jax.vmap(lambda count: prefix_mask(size, count))(clouds.count)[..., None]
+    valid = clouds.valid[..., None]
     points = jnp.where(valid, clouds.points, 0.0)
     centroid = jnp.sum(points, axis=1) / jnp.maximum(clouds.count, 1)[:, None]
     if config.released:

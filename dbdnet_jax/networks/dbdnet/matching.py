@@ -5,17 +5,19 @@ maximum over it bring (`ModelConfig.overlap_matching` is False there). A point t
 counterpart matches nothing well, and lies off the other cloud once both are coarsely registered.
 """
 
+import math
 from typing import NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Float
 
+from dbdnet_jax.networks.params import Shapes
 from dbdnet_jax.ops import rigid
 from dbdnet_jax.ops.grouping import squared_distances
 from dbdnet_jax.ops.rigid import HIGHEST
-from dbdnet_jax.ops.sampling import prefix_mask
 from dbdnet_jax.ops.sinkhorn import sinkhorn
 from dbdnet_jax.types import Cloud, Rigid
 
@@ -48,11 +50,27 @@ class MatchingLayer(nn.Module):
         alpha = self.param("alpha", nn.initializers.zeros, ()).astype(features.dtype)
         distance = squared_distances(features[0], features[1])
         affinity = -nn.softplus(beta) * (distance - alpha)
-        rows, columns = _valid(clouds)
+        rows, columns = clouds.valid
         log_matrix = sinkhorn(affinity, rows, columns, self.iterations)
         soft, mass = soft_targets(jnp.exp(log_matrix), clouds.points[1])
         motion, _ = rigid.procrustes(clouds.points[0], soft, mass)
         return SoftMatches(clouds, log_matrix, motion)
+
+
+def matching_shapes(name: str) -> Shapes:
+    """The parameters of a `MatchingLayer`."""
+    return {f"{name}/alpha": (), f"{name}/beta": ()}
+
+
+def initial_matching(name: str, width: int) -> dict[str, np.ndarray]:
+    """What a `MatchingLayer` on features of this width starts from.
+
+    Fresh features, normalised, lie about sqrt(2 width) apart: soft matches, half of the mass.
+    """
+    return {
+        f"{name}/alpha": np.array(1.5 * width, np.float32),
+        f"{name}/beta": np.array(math.log(math.expm1(4.0 / width)), np.float32),
+    }
 
 
 def soft_targets(
@@ -74,7 +92,7 @@ def match_features(matched: SoftMatches) -> Float[Array, "2 n f"]:
     clouds, log_matrix, motion = matched
     matrix = jnp.exp(log_matrix)
     points = jnp.stack([rigid.apply(motion, clouds.points[0]), clouds.points[1]])
-    valid = _valid(clouds)
+    valid = clouds.valid
     distance = squared_distances(points[0], points[1])
     distance = jnp.where(valid[0][:, None] & valid[1][None, :], distance, FAR)
 
@@ -87,7 +105,3 @@ def match_features(matched: SoftMatches) -> Float[Array, "2 n f"]:
     of_source = fit(matrix, distance, points[0], points[1])
     of_target = fit(matrix.T, distance.T, points[1], points[0])
     return jnp.stack([of_source, of_target])
-
-
-def _valid(clouds: Cloud) -> Bool[Array, "2 n"]:
-    return jax.vmap(lambda count: prefix_mask(clouds.points.shape[1], count))(clouds.count)

@@ -5,14 +5,29 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from dbdnet_jax.networks.blocks import Affine, AttentionBlock, DenseNorm, dense, over_clouds
+from dbdnet_jax.networks.blocks import (
+    Affine,
+    AttentionBlock,
+    DenseNorm,
+    affine_shapes,
+    attention_shapes,
+    dense,
+    dense_norm_shapes,
+    over_clouds,
+)
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
-from dbdnet_jax.networks.dbdnet.encoder import Encoder
-from dbdnet_jax.networks.dbdnet.matching import MatchingLayer, SoftMatches, match_features
+from dbdnet_jax.networks.dbdnet.encoder import Encoder, encoder_shapes
+from dbdnet_jax.networks.dbdnet.matching import (
+    FIT_FEATURES,
+    MatchingLayer,
+    SoftMatches,
+    match_features,
+    matching_shapes,
+)
+from dbdnet_jax.networks.params import Shapes
 from dbdnet_jax.ops.attention import position_code
 from dbdnet_jax.ops.grouping import masked_max
 from dbdnet_jax.ops.pyramid import Pyramid
-from dbdnet_jax.ops.sampling import prefix_mask
 from dbdnet_jax.types import Cloud
 
 
@@ -23,7 +38,11 @@ class OverlapNetwork(nn.Module):
 
     @nn.compact
     def __call__(
-        self, clouds: Cloud, pyramids: Pyramid, dropout_key: PRNGKeyArray | None = None
+        self,
+        clouds: Cloud,
+        pyramids: Pyramid,
+        dropout_key: PRNGKeyArray | None = None,
+        geometry: Float[Array, "2 n g"] | None = None,
     ) -> tuple[Float[Array, "2 n"], SoftMatches | None]:
         """Logits of the points of two clouds, stacked, each in farthest-point order.
 
@@ -33,10 +52,10 @@ class OverlapNetwork(nn.Module):
         """
         config = self.config
         encoder = Encoder(config.overlap_channels, config.neighbour_space, name="encoder")
-        features = over_clouds(encoder, clouds.points, pyramids)
+        features = over_clouds(encoder, clouds.points, pyramids, geometry)
         n, width = features.shape[1:]
         features = features + jax.vmap(lambda x: position_code(x, width))(clouds.points)
-        valid = jax.vmap(lambda count: prefix_mask(n, count))(clouds.count)
+        valid = clouds.valid
         keys = [None] * config.overlap_blocks
         if dropout_key is not None:
             keys = list(jax.random.split(dropout_key, config.overlap_blocks))
@@ -55,3 +74,16 @@ class OverlapNetwork(nn.Module):
             features = over_clouds(decode, features, valid)
         logits = dense(Affine(1, name="linear"), features.reshape(2 * n, -1)).reshape(2, n)
         return logits, matched
+
+
+def overlap_shapes(config: ModelConfig) -> Shapes:
+    """The parameters of an `OverlapNetwork`."""
+    width = 4 * config.overlap_channels
+    shapes = encoder_shapes("overlap/encoder", config.overlap_channels, config.inputs)
+    shapes |= attention_shapes("overlap/attention", config.overlap_blocks, width)
+    fan_in = 2 * width
+    if config.overlap_matching:
+        shapes |= matching_shapes("overlap/matching")
+        fan_in += FIT_FEATURES
+    shapes |= dense_norm_shapes("overlap/decoder", fan_in, config.head_layers)
+    return shapes | affine_shapes("overlap/linear", config.head_layers[-1][0], 1)

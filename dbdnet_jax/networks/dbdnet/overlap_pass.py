@@ -9,7 +9,9 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.dbdnet.frames import (
     centre_and_order,
+    geometry_of,
     move_source,
+    reordered,
     truncate_rows,
     uncentred,
 )
@@ -19,7 +21,7 @@ from dbdnet_jax.networks.params import Params
 from dbdnet_jax.ops import rigid
 from dbdnet_jax.ops.grouping import interpolate, interpolation_weights
 from dbdnet_jax.ops.pyramid import Pyramid, build_pyramids
-from dbdnet_jax.ops.sampling import inverse_order, prefix_mask
+from dbdnet_jax.ops.sampling import inverse_order
 from dbdnet_jax.types import Cloud, Rigid
 
 
@@ -32,6 +34,7 @@ class PreparedPair(NamedTuple):
     order: Int[Array, "2 n"]
     ordered: Cloud  # all points in that order
     nearest: tuple[Array, Array] | None  # of all points among the seen ones, to interpolate
+    geometry: Float[Array, "2 m g"] | None  # of all points, in the clouds' own row order
 
 
 def prepare_pair(config: ModelConfig, clouds: Cloud) -> PreparedPair:
@@ -42,7 +45,8 @@ def prepare_pair(config: ModelConfig, clouds: Cloud) -> PreparedPair:
     nearest = None
     if seen.points.shape[1] < ordered.points.shape[1]:
         nearest = jax.vmap(interpolation_weights)(ordered.points, seen.points, seen.count)
-    return PreparedPair(seen, centroid, pyramids, order, ordered, nearest)
+    geometry = geometry_of(clouds, config)
+    return PreparedPair(seen, centroid, pyramids, order, ordered, nearest, geometry)
 
 
 def apply_overlap_network(
@@ -55,7 +59,9 @@ def apply_overlap_network(
     network = OverlapNetwork(params.config)
     moved = move_source(prepared.seen, start)
     variables = {"params": params.overlap}
-    answer: Any = network.apply(variables, moved, prepared.pyramids, dropout_key)
+    rows = prepared.order[:, : moved.points.shape[1]]
+    geometry = reordered(prepared.geometry, rows)
+    answer: Any = network.apply(variables, moved, prepared.pyramids, dropout_key, geometry)
     logits, matched = answer
     if matched is not None:
         own = prepared.seen._replace(points=prepared.seen.points + prepared.centroid[:, None, :])
@@ -66,9 +72,7 @@ def apply_overlap_network(
 
 def probability_of_all(prepared: PreparedPair, logits: Float[Array, "2 n"]) -> Float[Array, "2 m"]:
     """Overlap probability of all points, in the clouds' own row order; zero in the padding."""
-    size = prepared.ordered.points.shape[1]
     if prepared.nearest is not None:
         logits = jax.vmap(interpolate)(logits[..., None], *prepared.nearest)[..., 0]
-    valid = jax.vmap(lambda count: prefix_mask(size, count))(prepared.ordered.count)
     logits = jnp.take_along_axis(logits, jax.vmap(inverse_order)(prepared.order), axis=1)
-    return jnp.where(valid, jax.nn.sigmoid(logits), 0.0)
+    return jnp.where(prepared.ordered.valid, jax.nn.sigmoid(logits), 0.0)

@@ -8,8 +8,10 @@ from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.dbdnet.frames import (
     centre_and_order,
     centred,
+    geometry_of,
     move_source,
     pad_rows,
+    reordered,
     stack_clouds,
     stack_masked,
     truncate_rows,
@@ -45,27 +47,38 @@ def register(
     far. Coordinates are expected at the scale the weights were trained at (the unit sphere for the
     CAD and ModelNet40 weights). Where nothing can be estimated ``valid`` is False and the motion
     the identity.
+
+    Raises:
+      ValueError: clouds of no or one row, or parameters of the overlap network alone.
     """
     if params.registration is None:
         raise ValueError(
             "register needs a registration network; these params hold only the overlap network. "
             "Use predict_overlap, or load a full checkpoint."
         )
+    for name, cloud in (("src", src), ("tgt", tgt)):
+        if cloud.shape[0] < 2:
+            raise ValueError(
+                f"{name} must be (n, 3) with n >= 2 (3 to be registered); got "
+                f"{cloud.shape}. Give more points."
+            )
     clouds, order = stack_masked(src, tgt, src_mask, tgt_mask)
     sizes = src.shape[0], tgt.shape[0]
     prepared = prepare_pair(params.config, clouds)
     start = rigid.identity(clouds.points.dtype)
     if params.config.overlap_passes == 1:
         logits, _ = apply_overlap_network(params, prepared, start)
-        return _register(params, clouds, order, probability_of_all(prepared, logits), sizes)
+        probability = probability_of_all(prepared, logits)
+        return _register(params, clouds, order, probability, sizes, prepared.geometry)
 
     level = clouds._replace(points=clouds.points - prepared.centroid[:, None, :])
 
     def pass_and_register(motion, _):
         logits, _ = apply_overlap_network(params, prepared, motion)
         moved = move_source(level, motion)
-        answer = _register(params, moved, order, probability_of_all(prepared, logits), sizes)
-        motion = rigid.compose(Rigid(answer.rotation, answer.translation), motion)
+        probability = probability_of_all(prepared, logits)
+        answer = _register(params, moved, order, probability, sizes, prepared.geometry)
+        motion = rigid.compose(answer.motion, motion)
         return motion, (motion, answer)
 
     _, answers = jax.lax.scan(pass_and_register, start, length=params.config.overlap_passes)
@@ -86,8 +99,7 @@ def register(
 
 def register_clouds(params: Params, source: Cloud, target: Cloud) -> Registration:
     """`register` of two clouds whose points are their first rows."""
-    masks = (prefix_mask(len(cloud.points), cloud.count) for cloud in (source, target))
-    return register(params, source.points, target.points, *masks)
+    return register(params, source.points, target.points, source.valid, target.valid)
 
 
 def predict_overlap(
@@ -150,7 +162,8 @@ def register_given_overlap(
     size = clouds.points.shape[1]
     order = jnp.broadcast_to(jnp.arange(size), (2, size))
     probability = jnp.stack([pad_rows(source_overlap, size), pad_rows(target_overlap, size)])
-    return _register(params, clouds, order, probability, sizes, dropout_key)
+    geometry = geometry_of(clouds, params.config)
+    return _register(params, clouds, order, probability, sizes, geometry, dropout_key)
 
 
 def select(
@@ -169,14 +182,18 @@ def select(
     return order, jnp.where(enough, jnp.sum(keep), jnp.minimum(at_least, count))
 
 
-def _register(params, clouds, order, probability, sizes, dropout_key=None) -> Registration:
+def _register(
+    params, clouds, order, probability, sizes, geometry, dropout_key=None
+) -> Registration:
     """Select, match, solve, and bring everything back to the caller's rows."""
     config = params.config
     chosen, count = jax.vmap(
         lambda p, c: select(p, c, config.overlap_threshold, config.min_points)
     )(jax.lax.stop_gradient(probability), clouds.count)
     kept = Cloud(jnp.take_along_axis(clouds.points, chosen[..., None], axis=1), count)
-    motion, correspondence, targets, sampled, solvable = _iterate(params, kept, dropout_key)
+    motion, correspondence, targets, sampled, solvable = _iterate(
+        params, kept, reordered(geometry, chosen), dropout_key
+    )
     seen = targets.shape[1]
     count = jnp.minimum(count, seen)
     beyond = kept.points.shape[1] - seen
@@ -212,7 +229,7 @@ def _identity_unless(valid: Bool[Array, ""], motion: Rigid) -> Rigid:
     return jax.tree.map(lambda found, rest: jnp.where(valid, found, rest), motion, identity)
 
 
-def _iterate(params: Params, kept: Cloud, dropout_key):
+def _iterate(params: Params, kept: Cloud, geometry: Array | None, dropout_key):
     """Run the registration network ``config.iterations`` times on the selected clouds.
 
     Returns the motion, the last correspondences and soft targets of both branches (rows in the
@@ -234,7 +251,8 @@ def _iterate(params: Params, kept: Cloud, dropout_key):
         )
         ordered, features = truncate_rows(ordered, config.registration_points), unmoved
         if features is None:
-            features = network.apply(variables, ordered, skip_rows, method="encode")
+            around = reordered(geometry, order[:, : ordered.points.shape[1]])
+            features = network.apply(variables, ordered, skip_rows, around, method="encode")
         matrix = jnp.asarray(network.apply(variables, ordered, features, key, method="match"))
         increment, targets, solvable = _solve(matrix, ordered, centroid, config)
         motion = rigid.compose(increment, motion)
@@ -263,7 +281,7 @@ def _solve(
         # Departure: not divided by the row's mass, so slack pulls points to the origin, and every
         # kept row weighs the same.
         soft = jnp.matmul(matrix, target, precision=HIGHEST)
-        valid = prefix_mask(source.shape[0], ordered.count[0]).astype(source.dtype)
+        valid = ordered.valid[0].astype(source.dtype)
         weights = jnp.broadcast_to(valid, matrix.shape[:2])
     else:
         soft, weights = jax.vmap(soft_targets, in_axes=(0, None))(matrix, target)

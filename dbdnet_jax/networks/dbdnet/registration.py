@@ -7,13 +7,22 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from dbdnet_jax.networks.blocks import Affine, AttentionBlock, DenseNorm, dense, over_clouds
+from dbdnet_jax.networks.blocks import (
+    Affine,
+    AttentionBlock,
+    DenseNorm,
+    affine_shapes,
+    attention_shapes,
+    dense,
+    dense_norm_shapes,
+    over_clouds,
+)
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
-from dbdnet_jax.networks.dbdnet.encoder import Encoder
+from dbdnet_jax.networks.dbdnet.encoder import Encoder, encoder_shapes
+from dbdnet_jax.networks.params import Shapes
 from dbdnet_jax.ops.attention import position_code
 from dbdnet_jax.ops.grouping import masked_max, squared_distances
 from dbdnet_jax.ops.pyramid import build_pyramids
-from dbdnet_jax.ops.sampling import prefix_mask
 from dbdnet_jax.ops.sinkhorn import sinkhorn
 from dbdnet_jax.types import Cloud
 
@@ -38,7 +47,7 @@ class ParameterNetwork(nn.Module):
         n = clouds.points.shape[1]
         tag = jnp.zeros((2, n, 1), clouds.points.dtype).at[1].set(1.0)
         x = jnp.concatenate([clouds.points, tag], axis=-1).reshape(2 * n, 4)
-        valid = jax.vmap(lambda count: prefix_mask(n, count))(clouds.count).reshape(2 * n)
+        valid = clouds.valid.reshape(2 * n)
         for layer, (features, groups) in enumerate(self.config.point_layers):
             x = DenseNorm(features, groups, name=f"point_{layer}")(x, valid)
         x = masked_max(x, valid)[None, :]
@@ -71,16 +80,20 @@ class RegistrationNetwork(nn.Module):
         clouds: Cloud,
         skip_rows: Int[Array, "2 n"] | None = None,
         dropout_key: PRNGKeyArray | None = None,
+        geometry: Float[Array, "2 n g"] | None = None,
     ) -> Float[Array, "2 n n"]:
         """Encode, then match."""
-        return self.match(clouds, self.encode(clouds, skip_rows), dropout_key)
+        return self.match(clouds, self.encode(clouds, skip_rows, geometry), dropout_key)
 
     def encode(
-        self, clouds: Cloud, skip_rows: Int[Array, "2 n"] | None = None
+        self,
+        clouds: Cloud,
+        skip_rows: Int[Array, "2 n"] | None = None,
+        geometry: Float[Array, "2 n g"] | None = None,
     ) -> Float[Array, "2 n d"]:
         """Point-wise features of two stacked clouds, each in farthest-point order."""
         pyramids = build_pyramids(clouds, self.config.neighbours, skip_rows)
-        return over_clouds(self.encoder, clouds.points, pyramids)
+        return over_clouds(self.encoder, clouds.points, pyramids, geometry)
 
     def match(
         self,
@@ -93,8 +106,7 @@ class RegistrationNetwork(nn.Module):
         Entry [b, i, j] is the mass that source point i gives to target point j in branch b;
         rows and columns past the counts are zero.
         """
-        n, width = features.shape[1:]
-        valid = jax.vmap(lambda count: prefix_mask(n, count))(clouds.count)
+        width, valid = features.shape[-1], clouds.valid
         features = features + jax.vmap(lambda x: position_code(x, width))(clouds.points)
         keys = [None] * 3 if dropout_key is None else jax.random.split(dropout_key, 3)
         shared = _run(self.attention, features, valid, keys[0])
@@ -120,3 +132,18 @@ def _run(blocks, features, valid, key):
     for block, block_key in zip(blocks, keys, strict=True):
         features = block(features, valid, block_key)
     return features
+
+
+def registration_shapes(config: ModelConfig) -> Shapes:
+    """The parameters of a `RegistrationNetwork`."""
+    width = 4 * config.registration_channels
+    last = config.point_layers[-1][0]
+    return {
+        **encoder_shapes("registration/encoder", config.registration_channels, config.inputs),
+        **attention_shapes("registration/attention", config.shared_blocks, width),
+        **attention_shapes("registration/attention_R", config.rotation_blocks, width),
+        **attention_shapes("registration/attention_t", config.translation_blocks, width),
+        **dense_norm_shapes("registration/weight_net/point", 4, config.point_layers),
+        **dense_norm_shapes("registration/weight_net/global", last, config.global_layers),
+        **affine_shapes("registration/weight_net/linear", config.global_layers[-1][0], 4),
+    }

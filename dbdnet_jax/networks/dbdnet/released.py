@@ -13,15 +13,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from dbdnet_jax.io.safe_pickle import CheckpointError
+from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.io.torch_pickle import load_torch
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
-from dbdnet_jax.networks.dbdnet.register import Params
+from dbdnet_jax.networks.dbdnet.overlap import overlap_shapes
+from dbdnet_jax.networks.dbdnet.registration import registration_shapes
 from dbdnet_jax.networks.params import (
-    NETWORKS,
+    Params,
     Shapes,
     flatten,
-    parameter_shapes,
+    require_finite,
     require_shapes,
     unflatten,
 )
@@ -42,8 +43,10 @@ _FIXED = {
         "overlap_passes",
         "overlap_points",
         "registration_points",
+        "local_geometry",
     )
 }
+_MOST_ENTRIES = 20_000  # the released network has 700
 _FIX = "Give a checkpoint that the released code saved, unaltered."
 # Our names to theirs, in this order, before / becomes a dot.
 _RULES = (
@@ -89,13 +92,17 @@ def from_released(path_or_state_dict: str | Path | Mapping[str, Any], *, k: int 
     Raises:
       CheckpointError: the file is refused or damaged, or entries are missing, unknown or
         misshapen; all are listed. The four modules that the released code declares and never uses
-        are ignored.
+        are ignored. Or numbers are not finite.
     """
     if isinstance(path_or_state_dict, Mapping):
         owner, saved = "The state dict", path_or_state_dict
     else:
         owner, saved = str(path_or_state_dict), load_torch(path_or_state_dict)
     state = _state_dict(saved, owner)
+    if len(state) > _MOST_ENTRIES:
+        raise CheckpointError(
+            f"{owner} must hold at most {_MOST_ENTRIES} entries; got {len(state)}. {_FIX}"
+        )
     full = any(name.startswith(_FULL) for name in state)
     overlap = _OVERLAP if full else ""
     unused = tuple(overlap + name for name in _UNUSED)
@@ -114,6 +121,7 @@ def from_released(path_or_state_dict: str | Path | Mapping[str, Any], *, k: int 
         if name.endswith("/kernel"):
             array = array.reshape(entry.shape[:2]).T
         arrays[name] = np.array(array, np.float32, order="C")
+    require_finite(arrays, owner)
     return unflatten(arrays, config)
 
 
@@ -162,7 +170,8 @@ def _state_dict(saved: Any, owner: str) -> dict[str, Any]:
         if isinstance(saved, Mapping):
             nested = [saved[key] for key in _NESTED if isinstance(saved.get(key), Mapping)]
             if not nested:
-                return {str(name).removeprefix("module."): x for name, x in saved.items()}
+                names = [name for name in saved if isinstance(name, str)]
+                return {name.removeprefix("module."): saved[name] for name in names}
             saved = nested[0]
     raise CheckpointError(f"{owner} must hold a state dict; got a {type(saved).__name__}. {_FIX}")
 
@@ -195,12 +204,15 @@ def _infer(found: Shapes, full: bool, k: int, owner: str) -> ModelConfig:
             "rotation_blocks": blocks("RegNet.attention_R"),
             "translation_blocks": blocks("RegNet.attention_t"),
         }
-    return ModelConfig(**sizes, neighbours=k, released=True)
+    try:
+        return ModelConfig(**sizes, neighbours=k, released=True)
+    except ValueError as error:
+        raise CheckpointError(f"{owner}: its shapes give no network: {error}") from error
 
 
 def _entries(config: ModelConfig, full: bool) -> dict[str, _Entry]:
     """Their name and shape of each of our parameters, by our name."""
-    shapes = parameter_shapes(config, NETWORKS if full else ("overlap",))
+    shapes = overlap_shapes(config) | (registration_shapes(config) if full else {})
     return {name: _entry(name, shape, full) for name, shape in shapes.items()}
 
 

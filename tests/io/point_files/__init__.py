@@ -1,1 +1,1 @@
-"""Tests of the readers of points, one file a format."""
+"""Tests of `dbdnet_jax.io.point_files`."""

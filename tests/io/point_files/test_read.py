@@ -8,7 +8,8 @@ import trimesh
 
 from dbdnet_jax.errors import MissingExtraError
 from dbdnet_jax.io.files import write_atomic
-from dbdnet_jax.io.point_files import MESH_SAMPLES, read_points, read_transform
+from dbdnet_jax.io.point_files import MESH_SAMPLES, read_points
+from dbdnet_jax.io.transform_files import read_transform
 from tests.conftest import random_cloud
 
 POINTS = random_cloud(1, 40)

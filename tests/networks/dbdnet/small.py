@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
-from dbdnet_jax.networks.params import Params, init_params
+from dbdnet_jax.networks.initial import init_params
+from dbdnet_jax.networks.params import Params
 from dbdnet_jax.types import Cloud
 from tests.conftest import GRADIENT, Tolerance, assert_close, random_cloud
 

@@ -83,7 +83,7 @@ def test_solves_coordinates_and_iterations(released, iterations, monkeypatch, x6
     monkeypatch.setattr(dbdnet, "RegistrationNetwork", StandIn)
     monkeypatch.setattr(StandIn, "encoded", [])
     config = dataclasses.replace(SMALL, released=released, iterations=iterations)
-    params = Params(overlap=None, registration={}, config=config)
+    params = Params({"registration": {}}, config)
     answer = jax.jit(register_given_overlap)(params, whole(SOURCE), whole(TARGET), *MASKS)
     assert answer.valid
     last, composed, soft = registered(released, iterations)
@@ -115,7 +115,7 @@ def test_the_frozen_overlap_network_gets_no_key_for_dropout(tmp_path, monkeypatc
     def registered(params, source, target, source_overlap, target_overlap, key=None):
         keys["registration"] = key
 
-    monkeypatch.setattr(stages, "load_best", lambda run_dir, joint: Params({}, None, model))
+    monkeypatch.setattr(stages, "load_best", lambda run_dir, joint: Params({"overlap": {}}, model))
     monkeypatch.setattr(stages, "predict_overlap_and_matches", predicted)
     monkeypatch.setattr(stages, "register_given_overlap", registered)
     monkeypatch.setattr(stages, "registration_loss", lambda *_: None)

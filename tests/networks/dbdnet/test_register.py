@@ -14,7 +14,7 @@ from dbdnet_jax.networks.dbdnet.register import (
     register_given_overlap,
     select,
 )
-from dbdnet_jax.networks.params import parameter_shapes
+from dbdnet_jax.networks.table import parameter_shapes
 from dbdnet_jax.ops import rigid
 from dbdnet_jax.types import Branch, Cloud, Registration, Rigid
 from tests import oracle

@@ -1,16 +1,18 @@
 """The authors' checkpoints: their names and layouts, found and refused."""
 
 import json
+import time
 from collections import OrderedDict
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from dbdnet_jax.io.safe_pickle import CheckpointError
+from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.dbdnet.released import from_released, to_released
-from dbdnet_jax.networks.params import flatten, parameter_shapes, unflatten
+from dbdnet_jax.networks.params import flatten, unflatten
+from dbdnet_jax.networks.table import parameter_shapes
 from tests.torch_files import save_stream, save_zip, tensor
 
 # Written once and checked against the names and shapes of a model built by the released code.
@@ -194,4 +196,27 @@ def test_what_their_code_cannot_run_is_not_written(state):
     with pytest.raises(ValueError, match="neighbour_space is 'feature' .* got 'coordinates'"):
         to_released(params.replace(config=ModelConfig(neighbour_space="coordinates")))
     with pytest.raises(ValueError, match="overlap=None"):
-        to_released(params.replace(overlap=None))
+        to_released(params.replace(networks={"registration": params.registration}))
+
+
+def test_numbers_that_are_not_finite_are_refused(state):
+    name = next(iter(state))
+    state[name] = np.full_like(state[name], np.nan)
+    with pytest.raises(CheckpointError, match="must hold finite numbers; .* 1 of"):
+        from_released(state)
+
+
+@pytest.mark.parametrize("count", [1000, 100_000])
+def test_any_number_of_blocks_is_refused_at_once(state, count):
+    stem = "overlap_predictor.attention."
+    state |= {f"{stem}{i}.self_attention.in_proj_weight": np.ones(1) for i in range(count)}
+    start = time.process_time()
+    with pytest.raises(CheckpointError, match=r"overlap_blocks must be from|at most 20000 entries"):
+        from_released(state)
+    assert time.process_time() - start < 2
+
+
+@pytest.mark.parametrize("k", [0, -1, 2.5, True, "20", 10**9])
+def test_a_number_of_neighbours_that_is_none_is_refused(state, k):
+    with pytest.raises(CheckpointError, match="neighbours must be"):
+        from_released(state, k=k)

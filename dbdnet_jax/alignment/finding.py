@@ -1,0 +1,177 @@
+"""From two normalised clouds to the pose, what else fits, and what speaks for it."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from dbdnet_jax.alignment import search
+from dbdnet_jax.alignment.candidates import (
+    Candidate,
+    choose,
+    examine,
+    far_starts,
+    merged,
+    near_starts,
+    rank,
+)
+from dbdnet_jax.alignment.normalised import NormalisedPair, is_full_resolution
+from dbdnet_jax.alignment.point_to_plane import refine_point_to_plane
+from dbdnet_jax.alignment.quality import PoseQuality, assess_pose, shared_point_score
+from dbdnet_jax.alignment.search import NetworkPose
+from dbdnet_jax.alignment.success import (
+    Coefficients,
+    PoseFeatures,
+    fit_features,
+    fit_score,
+    success_probability,
+)
+from dbdnet_jax.alignment.surfaces import Surface, inlier_distance, measure_fit, surface
+from dbdnet_jax.alignment.transforms import Transform, angle_between, move
+from dbdnet_jax.networks.params import Params
+
+LIKELY = 0.5  # success probability of a valid pose
+CONFIDENT = 0.9  # of a pose near the given orientation: no other rotations are searched
+SPARSE = 2000  # points: of fewer, soft matching may tell more than nearest neighbours do
+NO_OTHER = 4.0  # the margin where nothing else fits, and the most it counts
+MIRRORED = 1.5  # the score by which a mirrored source must fit better
+
+
+class Found(NamedTuple):
+    """The answer in the frame of a `NormalisedPair`, and all that is known of it."""
+
+    pose: Transform
+    score: float  # before the last step, as the others' are
+    others: list[Candidate]  # different poses, best first
+    margin: float  # score of the pose less that of the best other one
+    predicted: NetworkPose
+    quality: PoseQuality
+    evidence: PoseFeatures
+    probability: float
+    everywhere: bool
+
+
+def find_pose(
+    params: Params,
+    scene: NormalisedPair,
+    coefficients: Coefficients,
+    how: str,
+    *,
+    refine: bool,
+    guess: Transform | None,
+    proposals: list[Transform],
+) -> Found:
+    """Search near the given orientation, and everywhere where that is asked for or needed.
+
+    Without ``refine`` the network's pose, the guess and the proposals are judged as they are.
+    """
+    source, target = scene.source.surface, scene.target.surface
+    middle = source.points.mean(axis=0)
+    predicted = search.predict_pose(params, scene.source.sparse, scene.target.sparse)
+    given = proposals if guess is None else [guess, *proposals]
+    if not refine:
+        poses = rank([predicted.transform, *given], source, target, coefficients)
+        return settle(scene, poses, predicted, coefficients, guess, everywhere=False, last=False)
+    starts = near_starts(predicted.transform, source) + given
+    near = examine(starts, source, target, coefficients)
+    found = settle(scene, near, predicted, coefficients, guess, everywhere=False)
+    if how == "near" or (how == "auto" and found.probability >= CONFIDENT):
+        return found
+    far = examine(far_starts(source, target), source, target, coefficients)
+    every = merged(near, far, middle=middle)
+    return settle(scene, every, predicted, coefficients, guess, everywhere=True)
+
+
+def settle(
+    scene: NormalisedPair,
+    candidates: list[Candidate],
+    predicted: NetworkPose,
+    coefficients: Coefficients,
+    guess: Transform | None,
+    *,
+    everywhere: bool,
+    last: bool = True,
+) -> Found:
+    """Choose one of the candidates, refine it on all points, and say what speaks for it."""
+    source, target = scene.source.surface, scene.target.surface
+    row = choose(candidates, guess, source.points.mean(axis=0))
+    chosen, others = candidates[row], candidates[:row] + candidates[row + 1 :]
+    final = last_refined(chosen, source, target, coefficients) if last else chosen
+    distance = inlier_distance(source, target)
+    moved = move(final.pose, source.points)
+    quality = assess_pose(moved, target, distance)
+    shared = shared_point_score(moved, target, distance) if is_full_resolution(scene) else 0.0
+    # The others have not seen the last step: what it adds is no merit.
+    margin = min(chosen.score - others[0].score, NO_OTHER) if others else NO_OTHER
+    alike = [math.exp(min(other.score - chosen.score, 0.0)) for other in others]
+    evidence = PoseFeatures(
+        *fit_features(final.fit),
+        shared_point_score=shared,
+        overlap_agreement=_overlap_agreement(scene, predicted, final.pose, distance),
+        min_eigenvalue=math.log(max(quality.min_eigenvalue, 1e-6)),
+        network_angle=math.log1p(angle_between(final.pose, predicted.transform)[0]),
+        last_step_angle=math.log1p(angle_between(final.pose, chosen.pose)[0]),
+        ambiguity_margin=margin,
+        ambiguity_count=float(sum(alike)),
+        turn=math.log1p(angle_between(final.pose, np.eye(4))[0]),
+        everywhere=float(everywhere),
+    )
+    probability = success_probability(evidence, coefficients)
+    return Found(
+        final.pose,
+        chosen.score,
+        others,
+        margin,
+        predicted,
+        quality,
+        evidence,
+        probability,
+        everywhere,
+    )
+
+
+def last_refined(
+    candidate: Candidate, source: Surface, target: Surface, coefficients: Coefficients
+) -> Candidate:
+    """The candidate after refinement on all points, if that fits no worse."""
+    distance = inlier_distance(source, target)
+    radii = (distance,) * 6 + (0.7 * distance,) * 6
+    poses = [candidate.pose, refine_point_to_plane(candidate.pose, source, target, radii)]
+    if min(len(side.points) for side in (source, target)) < SPARSE:
+        clouds = (side.points[side.even] for side in (source, target))
+        poses.append(search.refine(candidate.pose, *clouds))
+    return rank(poses, source, target, coefficients)[0]
+
+
+def _overlap_agreement(
+    scene: NormalisedPair, predicted: NetworkPose, pose: Transform, distance: float
+) -> float:
+    """The mean probability that the network gives to what the pose says of each point."""
+    forth = scene.target.surface.tree.query(move(pose, scene.source.sparse))[0] < 2 * distance
+    back = np.linalg.inv(pose)
+    back_again = scene.source.surface.tree.query(move(back, scene.target.sparse))[0] < 2 * distance
+    pairs = ((predicted.source_overlap, forth), (predicted.target_overlap, back_again))
+    return float(np.mean([np.where(near, p, 1 - p).mean() for p, near in pairs]))
+
+
+def mirror_reason(scene: NormalisedPair, found: Found, coefficients: Coefficients) -> str:
+    """Why the clouds are no images of each other but mirrored ones; "" if they are not."""
+    if mirrored_margin(scene, found, coefficients) < MIRRORED:
+        return ""
+    return (
+        "the source fits clearly better when it is mirrored: is one cloud in a left-handed frame? "
+        "Negate one coordinate of it"
+    )
+
+
+def mirrored_margin(scene: NormalisedPair, found: Found, coefficients: Coefficients) -> float:
+    """The score by which the best pose of the mirrored source beats the answer."""
+    source, target = scene.source.surface, scene.target.surface
+    distance = inlier_distance(source, target)
+    flip = np.array([1.0, 1.0, -1.0])
+    moved = move(found.pose, source.points)
+    mirrored = surface((moved - moved.mean(axis=0)) * flip, source.even)
+    starts = far_starts(mirrored, target)
+    best = examine(starts, mirrored, target, coefficients, keep=4)
+    own = fit_score(measure_fit(found.pose, source, target, distance), coefficients)
+    return best[0].score - own

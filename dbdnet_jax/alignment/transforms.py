@@ -1,0 +1,49 @@
+"""Rigid transforms as 4x4 matrices in float64."""
+
+import itertools
+
+import numpy as np
+from jaxtyping import Float
+
+Transform = Float[np.ndarray, "4 4"]
+
+
+def as_transform(rotation: Float[np.ndarray, "3 3"], translation) -> Transform:
+    """A 4x4 float64 matrix; the rotation is the nearest one to the given matrix."""
+    u, _, vt = np.linalg.svd(np.asarray(rotation, np.float64))
+    transform = np.eye(4)
+    transform[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    transform[:3, 3] = translation
+    return transform
+
+
+def move(transform: Transform, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """A point or points under a 4x4 transform."""
+    return points @ transform[:3, :3].T + transform[:3, 3]
+
+
+def angle_between(a: Transform, b: Transform) -> tuple[float, Float[np.ndarray, "3"]]:
+    """Degrees and axis of the rotation that leads from pose b to pose a."""
+    from scipy.spatial.transform import Rotation
+
+    vector = Rotation.from_matrix(a[:3, :3] @ b[:3, :3].T).as_rotvec(degrees=True)
+    angle = float(np.linalg.norm(vector))
+    return angle, vector / angle if angle else np.eye(3)[0]
+
+
+def turn_deg(rotation: Float[np.ndarray, "*k 3 3"]) -> Float[np.ndarray, "*k"]:
+    """The angle of one rotation or of several."""
+    trace = np.trace(rotation, axis1=-2, axis2=-1)
+    return np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1)))
+
+
+def cube_rotations() -> Float[np.ndarray, "24 3 3"]:
+    """The 24 rotations of a cube, by angle: every rotation is within 63 degrees of one."""
+    signs = np.array(list(itertools.product((1.0, -1.0), repeat=3)))
+    found = [
+        np.eye(3)[list(order)] * sign[:, None]
+        for order in itertools.permutations(range(3))
+        for sign in signs
+    ]
+    proper = np.array([x for x in found if np.linalg.det(x) > 0])
+    return proper[np.argsort(turn_deg(proper), kind="stable")]

@@ -1,0 +1,1 @@
+"""FINet (Xu et al. 2022): global features in two branches, one for each half of the pose."""

@@ -1,0 +1,106 @@
+"""DBDNet's stages as tasks: which weights each one starts from, and which stand still."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import Any
+
+from dbdnet_jax.errors import CheckpointError
+from dbdnet_jax.networks.dbdnet.config import ModelConfig
+from dbdnet_jax.networks.params import Params
+from dbdnet_jax.training.checkpoint import load_best
+from dbdnet_jax.training.dbdnet import (
+    joint_loss_of,
+    overlap_loss_of,
+    registration_loss_of,
+    validate_joint,
+    validate_overlap,
+    validate_registration,
+)
+from dbdnet_jax.training.start import initial_params, load_start
+from dbdnet_jax.training.task import RunConfig, Task
+
+NETWORKS = ("overlap", "registration")
+
+
+def overlap_task(config: RunConfig, run_dir: str | Path) -> Task:
+    """Stage 1, from fresh weights or ``config.train.start``."""
+    settings = config.model, config.stages["overlap"].gamma
+    return Task(
+        initial_params(config).overlap,
+        None,
+        functools.partial(overlap_loss_of, *settings),
+        functools.partial(validate_overlap, *settings),
+    )
+
+
+def registration_task(config: RunConfig, run_dir: str | Path) -> Task:
+    """Stage 2, from fresh weights or ``config.train.start``.
+
+    Raises:
+        CheckpointError: predicted masks, and no trained overlap network in ``run_dir``.
+    """
+    stage = config.stages["registration"]
+    frozen = trained_overlap(config.model, run_dir) if stage.masks == "predicted" else None
+    radius = config.protocol.overlap_radius
+    return Task(
+        initial_params(config).registration,
+        frozen,
+        functools.partial(registration_loss_of, config.model, stage, radius),
+        functools.partial(validate_registration, config.model, stage),
+    )
+
+
+def joint_task(config: RunConfig, run_dir: str | Path) -> Task:
+    """Both networks further.
+
+    Raises:
+        CheckpointError: they are neither in ``run_dir`` nor in ``config.train.start``.
+    """
+    settings = config.stages["overlap"].gamma, config.stages["registration"].weights
+    return Task(
+        both_trained(config, run_dir),
+        None,
+        functools.partial(joint_loss_of, config.model, *settings),
+        functools.partial(validate_joint, config.model),
+        NETWORKS,
+    )
+
+
+def both_trained(config: RunConfig, run_dir: str | Path) -> dict[str, Any]:
+    """Both networks of the run or, where it has none, of ``config.train.start``."""
+    params, where = None, str(run_dir)
+    if any((Path(run_dir) / stage).is_dir() for stage in NETWORKS):
+        params = load_best(run_dir, joint=False)
+        _require_model(params, config.model, run_dir)
+    elif config.train.start:
+        params, where = load_start(config), config.train.start
+    if params is None or params.overlap is None or params.registration is None:
+        raise CheckpointError(
+            f"the joint stage goes on from two trained networks; {where} does not hold both. Train "
+            "them in that folder first (--stage=both), or give a new --run_dir and "
+            "--config.train.start=FILE with both."
+        )
+    return params.networks
+
+
+def trained_overlap(model: ModelConfig, run_dir: str | Path) -> Any:
+    """The run's overlap network, as it was before any joint stage."""
+    has_one = (Path(run_dir) / "overlap").is_dir()
+    params = load_best(run_dir, joint=False) if has_one else None
+    if params is None or params.overlap is None:
+        raise CheckpointError(
+            f"the registration stage needs a trained overlap network; {run_dir} has none. Train "
+            "it first (--stage=overlap or both), or set config.registration.masks='truth'."
+        )
+    _require_model(params, model, run_dir)
+    return params.overlap
+
+
+def _require_model(params: Params, model: ModelConfig, run_dir: str | Path) -> None:
+    if params.config != model:
+        raise CheckpointError(
+            f"both networks of a run must be of one configuration; {run_dir} holds one of "
+            f"{params.config}, config.model is {model}. Give another --run_dir."
+        )

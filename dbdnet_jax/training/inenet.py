@@ -1,0 +1,105 @@
+"""INENet's stage: the mask of either cloud, given the other."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from dbdnet_jax.metrics.pose import overlap_error, overlap_f1, pair_confusion
+from dbdnet_jax.networks.batch_norm import split_batch_stats
+from dbdnet_jax.networks.inenet.network import INENet, INENetConfig, as_channels, predict
+from dbdnet_jax.networks.params import Params
+from dbdnet_jax.training.start import initial_params
+from dbdnet_jax.training.task import RunConfig, Task, check_stage
+from dbdnet_jax.types import Cloud, Pair
+
+HUBER = 0.4  # where the loss turns from a parabola to a line
+
+
+@dataclasses.dataclass(frozen=True)
+class INENetStage:
+    """The authors' settings."""
+
+    epochs: float = 300.0
+    batch_size: int = 32
+    learning_rate: float = 1e-3
+
+    def __post_init__(self):
+        """Refuse a stage of nothing."""
+        check_stage("inenet", self)
+
+
+class INENetTerms(NamedTuple):
+    """The only term of the loss."""
+
+    mask: Float[Array, ""]
+
+
+def margin_loss(
+    margin: Float[Array, "*pairs n"],
+    labels: Bool[Array, "*pairs n"],
+    valid: Bool[Array, "*pairs n"],
+) -> Float[Array, ""]:
+    """Mean Huber loss between mask minus threshold and +1 or -1.
+
+    The margin lies in (-1, 1), so the loss is a line until it exceeds 0.6 on the right side.
+    """
+    miss = jnp.abs(margin - jnp.where(labels, 1.0, -1.0))
+    loss = jnp.where(miss < HUBER, 0.5 * miss * miss, HUBER * (miss - 0.5 * HUBER))
+    return jnp.sum(jnp.where(valid, loss, 0.0)) / jnp.maximum(jnp.sum(valid), 1)
+
+
+def loss_of_batch(
+    model: INENetConfig,
+    trainable: Any,
+    frozen: None,
+    pairs: Pair,
+    key: PRNGKeyArray,
+    batch_stats: Any,
+) -> tuple[Float[Array, ""], tuple[INENetTerms, Any]]:
+    """Of stacked pairs, each cloud in turn the source; both directions are one batch.
+
+    The authors train one direction only: their source is whole.
+    """
+    there, back = pairs.source, pairs.target
+    masked, channels = (
+        Cloud(jnp.concatenate([a.points, b.points]), jnp.concatenate([a.count, b.count]))
+        for a, b in ((there, back), (as_channels(back, model), as_channels(there, model)))
+    )
+    found, changed = INENet(model).apply(
+        {"params": trainable, "batch_stats": batch_stats},
+        masked,
+        channels,
+        training=True,
+        mutable=["batch_stats"],
+    )
+    labels = jnp.concatenate([pairs.source_overlap, pairs.target_overlap])
+    loss = margin_loss(found.margin, labels, masked.valid)
+    return loss, (INENetTerms(loss), changed["batch_stats"])
+
+
+def validate(
+    model: INENetConfig, weights: Any, frozen: None, pair: Pair
+) -> dict[str, Float[Array, ""]]:
+    """The share of points of the wrong class, and F1."""
+    answer = predict(Params({"inenet": weights}, model), pair.source, pair.target)
+    assert answer.source_overlap is not None and answer.target_overlap is not None  # its work
+    counts = pair_confusion(answer.source_overlap, answer.target_overlap, pair)
+    return {"error": overlap_error(counts), "f1": overlap_f1(counts)}
+
+
+def inenet_task(config: RunConfig, run_dir: str | Path) -> Task:
+    """The whole network, from fresh weights or ``config.train.start``."""
+    trainable, batch_stats = split_batch_stats(initial_params(config).networks["inenet"])
+    return Task(
+        trainable,
+        None,
+        functools.partial(loss_of_batch, config.model),
+        functools.partial(validate, config.model),
+        batch_stats=batch_stats,
+    )

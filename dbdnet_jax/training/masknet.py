@@ -1,0 +1,101 @@
+"""MaskNet's stage: the mask of either cloud, given the other."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from dbdnet_jax.metrics.pose import overlap_error, overlap_f1, pair_confusion
+from dbdnet_jax.networks.batch_norm import split_batch_stats
+from dbdnet_jax.networks.masknet.network import MaskNet, MaskNetConfig, predict
+from dbdnet_jax.networks.params import Params
+from dbdnet_jax.training.start import initial_params
+from dbdnet_jax.training.task import RunConfig, Task, check_stage
+from dbdnet_jax.types import Pair
+
+
+@dataclasses.dataclass(frozen=True)
+class MaskNetStage:
+    """The authors' settings."""
+
+    epochs: float = 500.0
+    batch_size: int = 32
+    learning_rate: float = 1e-4
+
+    def __post_init__(self):
+        """Refuse a stage of nothing."""
+        check_stage("masknet", self)
+
+
+class MaskNetTerms(NamedTuple):
+    """The only term of the loss."""
+
+    mask: Float[Array, ""]
+
+
+def mask_loss(
+    logits: Float[Array, "*pairs n"],
+    labels: Bool[Array, "*pairs n"],
+    valid: Bool[Array, "*pairs n"],
+) -> Float[Array, ""]:
+    """Mean over the points of the squared difference between mask and label."""
+    difference = jnp.where(valid, jax.nn.sigmoid(logits) - labels, 0.0)
+    return jnp.sum(difference**2) / jnp.maximum(jnp.sum(valid), 1)
+
+
+def loss_of_batch(
+    model: MaskNetConfig,
+    trainable: Any,
+    frozen: None,
+    pairs: Pair,
+    key: PRNGKeyArray,
+    batch_stats: Any,
+) -> tuple[Float[Array, ""], tuple[MaskNetTerms, Any]]:
+    """Of stacked pairs, each cloud in turn the template; both directions are one batch.
+
+    The authors train one direction only: their template is whole.
+    """
+    points = pairs.source.points, pairs.target.points
+    logits, changed = MaskNet(model).apply(
+        {"params": trainable, "batch_stats": batch_stats},
+        jnp.concatenate(points),
+        jnp.concatenate(points[::-1]),
+        jnp.concatenate([pairs.source.valid, pairs.target.valid]),
+        training=True,
+        mutable=["batch_stats"],
+    )
+    loss = mask_loss(
+        logits,
+        jnp.concatenate([pairs.target_overlap, pairs.source_overlap]),
+        jnp.concatenate([pairs.target.valid, pairs.source.valid]),
+    )
+    return loss, (MaskNetTerms(loss), changed["batch_stats"])
+
+
+def validate(
+    model: MaskNetConfig, weights: Any, frozen: None, pair: Pair
+) -> dict[str, Float[Array, ""]]:
+    """The share of points of the wrong class, and F1."""
+    answer = predict(Params({"masknet": weights}, model), pair.source, pair.target)
+    assert answer.source_overlap is not None and answer.target_overlap is not None  # its whole work
+    counts = pair_confusion(answer.source_overlap, answer.target_overlap, pair)
+    return {"error": overlap_error(counts), "f1": overlap_f1(counts)}
+
+
+def masknet_task(config: RunConfig, run_dir: str | Path) -> Task:
+    """The whole network, from fresh weights or ``config.train.start``."""
+    network = initial_params(config).networks["masknet"]
+    trainable, batch_stats = split_batch_stats(network)
+    return Task(
+        trainable,
+        None,
+        functools.partial(loss_of_batch, config.model),
+        functools.partial(validate, config.model),
+        batch_stats=batch_stats,
+    )

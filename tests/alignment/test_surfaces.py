@@ -1,0 +1,29 @@
+"""How a moved surface lies on another one."""
+
+import numpy as np
+import pytest
+
+from dbdnet_jax.alignment.quality import shared_point_score
+from dbdnet_jax.alignment.surfaces import inlier_distance, surface
+
+
+def grid(step: float) -> np.ndarray:
+    """A plane patch of points a ``step`` apart."""
+    axis = np.arange(0, 1 + step / 2, step)
+    x, y = np.meshgrid(axis, axis)
+    return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_the_wider_spacing_of_two_clouds_says_how_far_apart_inliers_may_be(swapped):
+    clouds = surface(grid(0.02)), surface(grid(0.1))
+    assert inlier_distance(*clouds[:: -1 if swapped else 1]) == pytest.approx(0.2)
+
+
+def test_points_in_common_are_told_by_the_targets_own_spacing():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0, 1, (400, 3)) * [1.0, 1.0, 0.0]
+    # Six copies of every point, a tenth of the target's spacing off: by their own spacing, which is
+    # a sixth of the target's, half of them would be no nearer than chance has it.
+    moved = np.concatenate([points + rng.normal(0, 0.002, points.shape) for _ in range(6)])
+    assert shared_point_score(moved, surface(points), 0.1) > 0.7

@@ -1,0 +1,1 @@
+"""DCP against its released code."""

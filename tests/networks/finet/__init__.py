@@ -1,0 +1,1 @@
+"""FINet against its released code."""

@@ -1,0 +1,1 @@
+"""INENet against its released code."""

@@ -1,0 +1,1 @@
+"""OMNet against its released code."""

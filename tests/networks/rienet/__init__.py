@@ -1,0 +1,1 @@
+"""RIENet against its released code."""
