@@ -47,7 +47,7 @@ REFUSED = {
     "index.txt": (rows("{0} " + PLAIN), "first column counts the rows"),
     "two sets.csv": ("x_m,y_m,z_m,x_ft,y_ft,z_ft\n" + rows("1,2,3,4,5,6"), "several of its col"),
     "angles.csv": ("id,lat,lon,h\n" + rows("P,{1:.5f},{2:.5f},{3:.5f}"), "angles, not lengths"),
-    "thousands.csv": (rows("1,234.5;2,345.6;{0},100.5"), "cannot be told apart"),
+    "thousands.csv": (rows("1,234.5;2,345.6;{0},100.5"), "no line has three numbers"),
     "either.csv": (rows("1,500;2,25{0:02d};9,100").replace("2,25", "2,2"), "may be decimal"),
     "pairs.csv": (rows("{1:.5f},{2:.5f},{3:.5f}", abs(POINTS)).replace(".", ","), "between col"),
     "cut.pts": ("90\n" + rows(PLAIN), "promises 90 rows, and it holds 40"),
