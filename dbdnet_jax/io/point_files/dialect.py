@@ -48,7 +48,7 @@ def uncommented(line: str) -> str:
     if text.startswith(COMMENTS):
         return ""
     if "#" in line and '"' not in line:
-        line = line.split("#", 1)[0]
+        line = re.split(r"(?<!1\.)#", line, maxsplit=1)[0]  # 1.#QNAN is no comment
     if "//" in line and '"' not in line:
         line = line.split("//", 1)[0]
     return line
