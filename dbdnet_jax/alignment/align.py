@@ -129,8 +129,7 @@ def align(
       overlap_threshold: probability above which a point enters the registration.
       max_points: of each cloud, for the network.
       seed: of the points drawn on a mesh; nothing else is random.
-      initial: a guess of the transform (4, 4). The network sees the source turned by it, and the
-        guess is left only where another pose fits clearly better.
+      initial: a guess of the transform (4, 4), left only where another pose fits clearly better.
       proposals: transforms (k, 4, 4) of anyone's making, judged as the network's own pose is.
 
     Raises:

@@ -150,7 +150,7 @@ def _all_decimal(rows: list[str], columns: list[int], separator: str | None) -> 
 
 def _find_way(rows: list[str], quoted: str) -> tuple[str | None, str]:
     """Separator and decimal mark by which every row has three numbers or more."""
-    counts = {way: _reads(rows, *way) for way in WAYS}
+    counts: dict[tuple[str | None, str], int] = {way: _reads(rows, *way) for way in WAYS}
     if max(counts.values()) < 3:
         counts = {way: _reads(rows, *way) for way in WAYS_OF_BLANKS}
     ways = [way for way, count in counts.items() if count >= 3]
@@ -296,4 +296,5 @@ def _is_units(line: str) -> bool:
 def _counts(rows: list[str], separator: str | None) -> bool:
     """Whether the first column of all rows goes up by one."""
     first = [parse(cells(row, separator)[0]) for row in rows]
-    return None not in first and all(b - a == 1 for a, b in zip(first, first[1:], strict=False))
+    steps = zip([None, *first], first, strict=False)
+    return all(b is not None and (a is None or b - a == 1) for a, b in steps)

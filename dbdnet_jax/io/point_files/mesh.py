@@ -75,7 +75,8 @@ def read_stl(file: BinaryIO, path: Path, seed: int) -> PointFile:
 def _ascii_facets(text: str) -> Float[np.ndarray, "f 3 3"]:
     if not any(line.split()[:1] == ["endsolid"] for line in text.lower().splitlines()[-50:]):
         raise FileFault(f"it has no endsolid at its end. {AGAIN}")
-    found, facet = [], None
+    found: list[list[list[float]]] = []
+    facet: list[list[float]] | None = None
     for number, line in enumerate(text.lower().splitlines(), 1):
         words = line.split()
         if words[:1] == ["facet"]:

@@ -98,8 +98,8 @@ def _field(kind: str, size: str, count: str) -> tuple[str, tuple[int]]:
 
 
 def _read_ascii(file: BinaryIO, head: Head) -> Float[np.ndarray, "n 3"]:
-    width = sum(head.dtype[i].shape[0] for i in range(len(head.dtype)))
-    offsets = np.cumsum([0, *(head.dtype[i].shape[0] for i in range(len(head.dtype)))])
+    counts = [head.dtype[name].shape[0] for name in head.dtype.names or ()]
+    width, offsets = sum(counts), np.cumsum([0, *counts])
     columns = [int(offsets[int(name)]) for name in head.xyz]
     parts, found = [np.empty((0, 3))], 0
     lines = (line.decode("latin-1") for line in file)

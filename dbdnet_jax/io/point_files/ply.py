@@ -22,7 +22,7 @@ class Element(NamedTuple):
     """One kind of row that a PLY holds."""
 
     name: str
-    count: int
+    count: int  # type: ignore[assignment]  # not tuple.count
     properties: tuple[tuple[str, ...], ...]
 
 
