@@ -13,16 +13,19 @@ from pathlib import Path
 
 import numpy as np
 
-NAMES = ("dcp", "rienet", "omnet", "finet", "inenet")
+NAMES = ("dcp", "rienet", "omnet", "finet", "masknet", "inenet")
 LIMIT = 300_000
 CORNER = (2, 24, 24)
-INPUTS = re.compile(r"(source|target|source_mask_gt|dropout_uniform)$|override/|config/")
+INPUTS = re.compile(
+    r"(source|target|template|(source|template)_mask_gt|dropout_uniform)$|override/|config/"
+)
 DROPPED = {
     "dcp": r"trained",
     "rienet": r"trained",
     "omnet": r"(grad_norm|after_one_forward)/\w+\.[12]\.",
     # The tests in the repository stop after the first turn.
     "finet": r"(grad_norm|after_one_forward|override)/\w+\.[123]\.|iteration[123]/",
+    "masknet": r"^$",
     "inenet": r"^$",
 }
 

@@ -11,9 +11,12 @@ import numpy as np
 import pytest
 
 from dbdnet_jax.classical import open3d as classical
+from dbdnet_jax.data.test_pairs import PairSet
+from dbdnet_jax.evaluation import run as evaluation
 from dbdnet_jax.evaluation import tables as reports
 from dbdnet_jax.evaluation.methods import (
     Method,
+    Traits,
     from_network,
     from_normals,
     from_points,
@@ -191,6 +194,37 @@ def test_the_table_holds_figures_definitions_and_where_they_come_from():
         "0.125", "0.1250", "0.125", "0.1250", "0.125", "0.1250", "0.125", "0.1250",
         "12.5", "%", "12.5", "%", "0.013",
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("accuracy", "f1", "skill"), [(0.9, 0.8636, False), (0.76, 0.95, False), (0.761, 0.8637, True)]
+)
+def test_skill_is_to_be_above_the_constant_in_accuracy_and_in_f1(accuracy, f1, skill):
+    row = Row("network", summary(0.25), 0.5, overlap=OverlapSummary(accuracy, 0.8, 0.9, f1))
+    assert ("no skill" not in reports.render(make_evaluation(row))) == skill
+
+
+@pytest.mark.parametrize("scanned", [True, False])
+def test_scans_have_no_refined_row_and_no_normals(pairs, monkeypatch, scanned):
+    still = from_points(classical.identity)
+    methods = [
+        Method("still", still),
+        Method("network, refined", still, Traits(learned=True, refined=True)),
+        Method("with normals", still, Traits(needs_normals=True)),
+    ]
+    monkeypatch.setattr(evaluation, "make_methods", lambda *_: methods)
+    corresponding = [
+        (s[:COUNT], t[:COUNT]) for s, t in zip(pairs[0].points, pairs[1].points, strict=True)
+    ]
+    scans = Scans(["a", "b", "b"], np.array([False, False, True]), corresponding)
+    if scanned:
+        pairs = pairs._replace(source_normals=np.zeros_like(pairs.source_normals))
+    test = PairSet("set", pairs, "a1", scans if scanned else None)
+    found = evaluation.evaluate([], test, seed=0, command="", count=2)
+    assert found.pairs == 2 and found.pair_set == "set_first_2"
+    assert [row.method for row in found.rows] == (
+        ["still"] if scanned else [method.name for method in methods]
+    )
 
 
 def test_registration_recall_has_a_table_of_its_own():

@@ -3,6 +3,7 @@
 from dbdnet_jax.networks.dcp.network import DCPConfig
 from dbdnet_jax.networks.finet.network import FINetConfig
 from dbdnet_jax.networks.inenet.network import INENetConfig
+from dbdnet_jax.networks.masknet.network import MaskNetConfig
 from dbdnet_jax.networks.omnet.network import OMNetConfig
 from dbdnet_jax.networks.rienet.network import RIENetConfig
 
@@ -17,6 +18,7 @@ CONFIGS = {
     "finet": FINetConfig(
         turns=2, encoder=(8, 8, 16), exchanges=(1, 2), fusion=(16, 8), regression=(16, 8)
     ),
+    "masknet": MaskNetConfig(encoder=(8, 16), head=(16, 8)),
     "inenet": INENetConfig(
         points=SIZE,
         transform=(8, 16),

@@ -64,6 +64,15 @@ def test_fresh_parameters_are_distributed_as_torch_does():
     assert (arrays["overlap/decoder_0/norm/scale"] == 1).all()
 
 
+def test_matching_starts_soft():
+    arrays = flatten(init_params(jax.random.key(0), CONFIG))
+    width = 4 * CONFIG.overlap_channels
+    beta, alpha = (arrays[f"overlap/matching/{name}"] for name in ("beta", "alpha"))
+    # Normalised features lie about sqrt(2 width) apart: an affinity of -2 beside a slack of 0.
+    assert -np.log1p(np.exp(beta)) * (2 * width - alpha) == pytest.approx(-2.0, rel=1e-5)
+    assert alpha == 1.5 * width
+
+
 def test_flatten_and_unflatten_undo_each_other():
     shapes = parameter_shapes(CONFIG, ("registration",))
     rng = np.random.default_rng(0)

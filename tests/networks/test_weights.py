@@ -115,6 +115,18 @@ def test_altered_content_is_found(path):
     assert same(load_params(path), make())
 
 
+def test_the_checksum_is_of_names_and_arrays():
+    arrays = {"a": np.zeros(3, "f4"), "b": np.ones(3, "f4")}
+    given = weights._checksum("header", arrays)
+    for other in (
+        {"a": arrays["b"], "b": arrays["a"]},
+        {"a": arrays["a"], "c": arrays["b"]},  # the same bytes in the same order
+        {"a": arrays["a"].reshape(3, 1), "b": arrays["b"]},
+    ):
+        assert weights._checksum("header", other) != given
+    assert weights._checksum("header", dict(reversed(arrays.items()))) == given
+
+
 def test_newer_files_are_refused_by_what_is_new(path):
     model = dataclasses.asdict(CONFIG)
     rewrite_header(path, model=model | {"wings": 2, "fins": 1})

@@ -64,6 +64,21 @@ def test_the_newest_two_and_the_best_are_kept(tmp_path):
         assert steps(tmp_path) == {6, 7, 8}
 
 
+def test_of_equal_errors_the_one_trained_longer_is_the_best(tmp_path):
+    with Checkpoints(tmp_path) as checkpoints:
+        for step in (1, 2):
+            checkpoints.save(step, state(step), 0.5)
+        assert steps(tmp_path) == {1, 2} and checkpoints.best_step() == 2
+
+
+def test_what_an_older_release_did_not_write_has_its_default(tmp_path):
+    defaults = {"train": {"seed": 0, "schedule": "cosine"}, "joint": {"epochs": 1.0}}
+    write_stage(tmp_path / "overlap", {"train": {"seed": 3}})
+    write_stage(tmp_path / "overlap", {"train": {"seed": 3, "schedule": "cosine"}}, defaults)
+    with pytest.raises(CheckpointError, match="schedule = cosine, this configuration constant"):
+        write_stage(tmp_path / "overlap", {"train": {"seed": 3, "schedule": "constant"}}, defaults)
+
+
 def test_a_folder_left_by_a_kill_while_saving_is_no_checkpoint(tmp_path):
     with Checkpoints(tmp_path) as checkpoints:
         checkpoints.save(1, state(1))
