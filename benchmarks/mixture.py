@@ -15,15 +15,15 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from dbdnet_jax.sources import VALIDATION_SEED
+from dbdnet_jax.weights import load_named
 
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.mixture import PARTS, make_part_pair, stock_of
 from dbdnet_jax.data.pairs import Protocol, make_pair
 from dbdnet_jax.data.worlds import OTHERS
 from dbdnet_jax.evaluation import evaluate_method, from_network
-from dbdnet_jax.sources import VALIDATION_SEED
 from dbdnet_jax.types import Pair
-from dbdnet_jax.weights import load_named
 
 PROTOCOL_PAIRS = 194
 LITTLE = 0.5  # overlap below which a pair counts as one of little
