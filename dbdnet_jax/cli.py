@@ -36,8 +36,9 @@ examples:
   dbdnet-register scan_a.ply scan_b.ply --report report.html --png report.png
   dbdnet-register --batch pairs.txt -o transforms/ --report pages/
 
-A file is a cloud (.ply .pcd .xyz .txt .csv .npy .npz) or a mesh (.ply .obj .off .stl .glb), of any
-size; both in the same unit. The transform T is 4x4: B ~ T A.
+A file is a cloud (.ply .pcd .xyz .asc .pts .ptx .txt .csv .npy .npz .bin, and .las .laz .e57 with
+the extra "formats") or a mesh (.ply .obj .off .stl .glb), of any size; both in the same unit.
+The transform T is 4x4: B ~ T A.
 
 A batch is a text file with two paths a line (from its own folder; # comments), or a folder whose
 files are named NAME_source.* and NAME_target.*; transforms go to FOLDER/NAME.txt, reports to
@@ -236,18 +237,18 @@ def _run(job: Job, options: argparse.Namespace, settings: dict) -> int:
 
     from dbdnet_jax.alignment.align import align
     from dbdnet_jax.alignment.writing import as_json, write_ply, write_transform
-    from dbdnet_jax.io.point_files import read_points
+    from dbdnet_jax.io.point_files import read_point_file
 
     files = {"source": str(job.pair.source), "target": str(job.pair.target)}
     say(f"{files['source']} -> {files['target']} ...", to_stderr=True)
-    source = read_points(job.pair.source, "source", seed=options.seed)
-    target = read_points(job.pair.target, "target", seed=options.seed + 1)
+    source = read_point_file(job.pair.source, "source", seed=options.seed)
+    target = read_point_file(job.pair.target, "target", seed=options.seed + 1)
     alignment = align(source, target, **settings)
     if job.transform is not None:
         write_transform(job.transform, alignment)
     if job.aligned is not None:
-        write_ply(job.aligned, source @ alignment.rotation.T + alignment.translation)
-    _draw(job, alignment, source, target, options.command)
+        write_ply(job.aligned, source.points @ alignment.rotation.T + alignment.translation)
+    _draw(job, alignment, source.points, target.points, options.command)
     if options.json:
         # Escaped as text is everywhere: JSON itself leaves one control character as it is.
         say(json.dumps(files | as_json(alignment)).replace("\x7f", "\\u007f"))

@@ -23,7 +23,7 @@ from dbdnet_jax.alignment.success import PoseFeatures, load_coefficients
 from dbdnet_jax.alignment.transforms import Transform, as_transform
 from dbdnet_jax.alignment.validity import rejection_reason, warnings
 from dbdnet_jax.io.forks import require_own_jax
-from dbdnet_jax.io.point_files import read_points
+from dbdnet_jax.io.point_files import read_point_file
 from dbdnet_jax.io.programs import loading_seconds
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import load_pretrained
@@ -117,21 +117,19 @@ def align(
     """Find the motion that brings ``source`` onto ``target``.
 
     Args:
-      source: (n, 3) numbers, n >= 16, or a file; see `point_files.read_points`.
+      source: (n, 3) numbers, n >= 16, or a file; see `point_files.read_point_file`.
       target: the same, (m, 3), in the same unit.
       params: the network; the weights in the package, if None.
-      refine: refine poses. Without, the network's pose (or a better one of those given) is the
-        answer, and nothing else is searched.
-      search: "near" for poses near the given orientation (or near ``initial``), "any" for all
-        rotations, "auto" for the latter only where the former leaves a doubt. Of poses that fit
-        alike the one nearest to the given orientation is the answer.
+      refine: refine poses; else the best of the network's and those given is the answer.
+      search: "near" for poses near the given orientation (or ``initial``), "any" for all rotations,
+        "auto" for these only where the former leave a doubt. Of poses that fit alike the one
+        nearest to the given orientation is the answer.
       scale: factor from the clouds' unit to the weights'; "auto" brings the larger cloud to the
         size of a partial scan of a shape in the unit sphere.
       overlap_threshold: probability above which a point enters the registration.
       max_points: of each cloud, for the network.
       seed: of the points drawn on a mesh; nothing else is random.
-      initial: a guess of the transform (4, 4). The network sees the source turned by it, and the
-        guess is left only where another pose fits clearly better.
+      initial: a guess of the transform (4, 4), left only where another pose fits clearly better.
       proposals: transforms (k, 4, 4) of anyone's making, judged as the network's own pose is.
 
     Raises:
@@ -140,41 +138,46 @@ def align(
       RuntimeError: the process was forked after JAX was used, and would hang; spawn it.
     """
     require_own_jax("align")
-    laps = {"start": _clock()}
-    loaded = loading_seconds()
     _check_arguments(search, scale, overlap_threshold, max_points)
     guess = np.eye(4) if initial is None else _check_transform(initial)
     proposed = [_check_transform(x, f"proposals[{i}]") for i, x in enumerate(proposals)]
-    given = read_points(source, "source", seed=seed), read_points(target, "target", seed=seed + 1)
+    laps, loaded = {"start": _clock()}, loading_seconds()
+    source = read_point_file(source, "source", seed=seed)
+    target = read_point_file(target, "target", seed=seed + 1)
     laps["read"] = _clock()
+    params = _with_threshold(params, overlap_threshold)
+    coefficients = load_coefficients()
+    laps["weights"] = _clock()
+    scene = normalise_pair(source.points, target.points, scale, max_points, guess)
+    laps["downsample"] = _clock()
+    given = None if initial is None else as_normalised(guess, scene)
+    others = [as_normalised(transform, scene) for transform in proposed]
+    found = finding.find_pose(
+        params, scene, coefficients, search, refine=refine, guess=given, proposals=others
+    )
+    laps["search"] = _clock()
+    reason = rejection_reason(scene, found)
+    reason = reason or (finding.mirror_reason(scene, found, coefficients) if refine else "")
+    laps["quality"] = _clock()
+    return _report(scene, found, reason, (*source.notes, *target.notes), laps, loaded)
+
+
+def _with_threshold(params: Params | None, overlap_threshold: float) -> Params:
+    """The network, or that of the package, with a threshold of its own."""
     params = load_pretrained() if params is None else params
     if params.overlap is None or params.registration is None:
         raise ValueError("params must hold both networks; one is None. Load a full set of weights.")
     config = dataclasses.replace(params.config, overlap_threshold=float(overlap_threshold))
-    params = dataclasses.replace(params, config=config)
-    coefficients = load_coefficients()
-    laps["weights"] = _clock()
-    scene = normalise_pair(*given, scale, max_points, guess)
-    laps["downsample"] = _clock()
-    found = finding.find_pose(
-        params,
-        scene,
-        coefficients,
-        search,
-        refine=refine,
-        guess=None if initial is None else as_normalised(guess, scene),
-        proposals=[as_normalised(transform, scene) for transform in proposed],
-    )
-    laps["search"] = _clock()
-    reason = rejection_reason(scene, found)
-    if not reason and refine:
-        reason = finding.mirror_reason(scene, found, coefficients)
-    laps["quality"] = _clock()
-    return _report(scene, found, reason, laps, loaded)
+    return dataclasses.replace(params, config=config)
 
 
 def _report(
-    scene: NormalisedPair, found: Found, reason: str, laps: dict[str, float], loaded: float
+    scene: NormalisedPair,
+    found: Found,
+    reason: str,
+    notes: tuple[str, ...],
+    laps: dict[str, float],
+    loaded: float,
 ) -> Alignment:
     """Everything that is known of a pose, in the units and rows of the clouds as given."""
     quality = found.quality
@@ -189,7 +192,7 @@ def _report(
         valid=not reason,
         reason=reason,
         success_probability=found.probability,
-        warnings=tuple(warnings(scene, found)),
+        warnings=(*notes, *warnings(scene, found)),
         inlier_ratio=float(quality.inlier.mean()),
         inlier_distance=quality.distance / scene.factor,
         rmse=quality.rmse / scene.factor,

@@ -74,8 +74,8 @@ PARTS = {  # by the names of `Mixture`
 class Stock(NamedTuple):
     """Shapes to build worlds of, and for each point a near one, to draw points between the two."""
 
-    points: Float[Array, "s n 3"]
-    near: Int[Array, "s n"]
+    points: Float[Array | np.ndarray, "s n 3"]
+    near: Int[Array | np.ndarray, "s n"]
 
 
 def stock_of(points: Float[np.ndarray, "s n 3"], *, seed: int = 0) -> Stock:

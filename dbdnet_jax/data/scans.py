@@ -131,7 +131,7 @@ def noisy(
 
 
 def centred_cloud(points: Float[Array, "n 3"], count: Int[Array, ""]):
-    """The cloud about its own centre, that centre, and its size: `alignment.thinning`'s."""
+    """The cloud about its own centre, that centre, and within what 98 % of it lie."""
     valid = prefix_mask(len(points), count)
     total = jnp.maximum(count, 1)
     centre = jnp.sum(jnp.where(valid[:, None], points, 0.0), axis=0) / total

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from configs import threedmatch
 from dbdnet_jax.data.cad import cad_split
+from dbdnet_jax.data.mixture import Mixture
 from dbdnet_jax.data.modelnet40 import FILES, load_modelnet40
 from dbdnet_jax.data.threedmatch import load_info
 from dbdnet_jax.data.training_pairs import (
@@ -109,3 +110,19 @@ def test_scans_come_in_batches_and_go_on_where_they_were(tmp_path, monkeypatch):
     jax.tree.map(np.testing.assert_array_equal, resumed, batches[2])
     pair = source.draw(jax.random.key(0), jnp.asarray(5), jax.tree.map(jnp.asarray, batches[2]))
     jax.tree.map(lambda one, both: np.testing.assert_array_equal(one, both[1]), pair, batches[2])
+
+
+def test_a_share_of_the_pairs_is_of_the_mixture():
+    shapes = stand_in.shapes(count=2, points=64)
+    clean = dataclasses.replace(stand_in.PROTOCOL, noise_sigma=0.0)
+    key = jax.random.key(0)
+
+    def translations(mixture):
+        pairs = pairs_of_shapes(shapes, shapes, clean, seed=0, validation_pairs=1, mixture=mixture)
+        arrays = jax.tree.map(jnp.asarray, next(pairs.arrays(0)))
+        draw = jax.jit(lambda n: pairs.draw(jax.random.fold_in(key, n), n, arrays).target.points)
+        return np.array([np.linalg.norm(draw(jnp.asarray(n)).mean(axis=0)) for n in range(40)])
+
+    # The mixture's clouds are centred; a crop of the protocol is not.
+    assert (translations(Mixture()) > 1e-3).all()
+    assert 0.3 < (translations(Mixture(low_overlap=0.3, turned=0.3)) < 1e-5).mean() < 0.9

@@ -126,6 +126,37 @@ def test_networks_of_several_passes_go_on_from_weights(run_dir, tmp_path, stage)
     assert np.mean(moved) > 0.9
 
 
+def test_weights_that_see_coordinates_only_go_on_with_local_geometry(run_dir, tmp_path):
+    weights = tmp_path / "weights.npz"
+    start = load_best(run_dir)
+    save_params(weights, start)
+    settings = dataclasses.replace(
+        SETTINGS,
+        model=dataclasses.replace(SETTINGS.model, local_geometry=2),
+        train=dataclasses.replace(SETTINGS.train, start=str(weights)),
+    )
+    task = make_task(settings, "overlap", tmp_path)
+    kernel = task.trainable["encoder"]["stage1_conv1"]["conv_0"]["kernel"]
+    before = start.overlap["encoder"]["stage1_conv1"]["conv_0"]["kernel"]
+    assert kernel.shape[0] == before.shape[0] + 2 * 16
+    assert_close(kernel[:3], before[:3], EXACT)
+    assert_close(kernel[19:22], before[3:], EXACT)
+    assert not kernel[3:19].any() and not kernel[22:].any()
+
+
+def test_a_constant_rate_lets_a_run_be_prolonged(tmp_path):
+    settings = dataclasses.replace(
+        SETTINGS, train=dataclasses.replace(SETTINGS.train, decay_epochs=1.0)
+    )
+    longer = dataclasses.replace(
+        settings, overlap=dataclasses.replace(settings.overlap, epochs=4.0)
+    )
+    fit(settings, "overlap", tmp_path, source())
+    fit(longer, "overlap", tmp_path, source())
+    rows = (tmp_path / "overlap" / "train.csv").read_text().splitlines()
+    assert rows[-1].startswith("8,")
+
+
 def test_a_start_must_be_there(tmp_path):
     train = dataclasses.replace(CONFIG.train, start=str(tmp_path / "gone.npz"))
     with pytest.raises(FileNotFoundError, match="there is none at .*gone.npz. Give its path, or"):

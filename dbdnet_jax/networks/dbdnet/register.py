@@ -51,17 +51,7 @@ def register(
     Raises:
       ValueError: clouds of no or one row, or parameters of the overlap network alone.
     """
-    if params.registration is None:
-        raise ValueError(
-            "register needs a registration network; these params hold only the overlap network. "
-            "Use predict_overlap, or load a full checkpoint."
-        )
-    for name, cloud in (("src", src), ("tgt", tgt)):
-        if cloud.shape[0] < 2:
-            raise ValueError(
-                f"{name} must be (n, 3) with n >= 2 (3 to be registered); got "
-                f"{cloud.shape}. Give more points."
-            )
+    _require_both(params, src, tgt)
     clouds, order = stack_masked(src, tgt, src_mask, tgt_mask)
     sizes = src.shape[0], tgt.shape[0]
     prepared = prepare_pair(params.config, clouds)
@@ -95,6 +85,21 @@ def register(
         rotation_branch=rotation_branch,
         translation_branch=translation_branch,
     )
+
+
+def _require_both(params: Params, src: jax.Array, tgt: jax.Array) -> None:
+    """Refuse half a network, and clouds without neighbours."""
+    if params.registration is None:
+        raise ValueError(
+            "register needs a registration network; these params hold only the overlap network. "
+            "Use predict_overlap, or load a full checkpoint."
+        )
+    for name, cloud in (("src", src), ("tgt", tgt)):
+        if cloud.shape[0] < 2:
+            raise ValueError(
+                f"{name} must be (n, 3) with n >= 2 (3 to be registered); got "
+                f"{cloud.shape}. Give more points."
+            )
 
 
 def register_clouds(params: Params, source: Cloud, target: Cloud) -> Registration:

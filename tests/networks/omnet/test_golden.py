@@ -92,7 +92,7 @@ def test_evaluation():
     )
     for i, (turn, term) in enumerate(zip(turns, terms, strict=True)):
         check_turn(turn, term, pair, truth, "eval", i, EVALUATION)
-    empty = ~turns[2].masks[1].any(axis=-1)
+    empty = ~turns[3].masks[1].any(axis=-1)  # as turn 2 predicts them
     assert empty.sum() == 2  # targets without a point left go on
     arrays = bundle("omnet")
     assert_near(sum(sum(term) for term in terms), arrays["eval/loss/total"], EVALUATION)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from dbdnet_jax.errors import MissingExtraError
 from dbdnet_jax.io.files import write_atomic
 from dbdnet_jax.io.point_files import MESH_SAMPLES, read_points
 from dbdnet_jax.io.transform_files import read_transform
@@ -82,18 +83,23 @@ def test_a_scene_of_several_meshes_is_one_cloud(tmp_path):
     assert np.mean(x > 5) == pytest.approx(0.5, abs=0.02)
 
 
-def test_pcd_is_read_where_open3d_is(tmp_path):
+def test_pcd_is_read_as_open3d_writes_it(tmp_path):
     open3d = pytest.importorskip("open3d")
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(POINTS))
     open3d.io.write_point_cloud(str(tmp_path / "a.pcd"), cloud)
     np.testing.assert_allclose(read_points(tmp_path / "a.pcd"), POINTS, atol=1e-6)
 
 
-def test_pcd_without_open3d_says_what_to_install(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "open3d", None)
-    (tmp_path / "a.pcd").write_bytes(b"# .PCD")
-    with pytest.raises(ImportError, match=r"needs Open3D.*pip install"):
-        read_points(tmp_path / "a.pcd")
+@pytest.mark.parametrize(
+    ("ending", "library"), [("las", "laspy"), ("laz", "lazrs"), ("e57", "pye57")]
+)
+def test_an_absent_library_says_what_to_install(tmp_path, monkeypatch, ending, library):
+    if library == "lazrs":
+        pytest.importorskip("laspy")
+    monkeypatch.setitem(sys.modules, library, None)
+    (tmp_path / f"a.{ending}").write_bytes(b"LASF")
+    with pytest.raises(MissingExtraError, match=rf"need {library}.*pip install .*formats"):
+        read_points(tmp_path / f"a.{ending}")
 
 
 def test_an_obj_opens_no_other_file(tmp_path):
