@@ -16,7 +16,6 @@ from dbdnet_jax.data.scans import Seen, centred_cloud, cut, noisy, sample, share
 from dbdnet_jax.data.worlds import OTHERS, Surface, World, draw_world
 from dbdnet_jax.ops import rigid
 from dbdnet_jax.ops.grouping import squared_distances
-from dbdnet_jax.ops.sampling import prefix_mask
 from dbdnet_jax.types import Cloud, Pair, Rigid
 
 LEAST_SHARED = 0.15  # of the smaller view, by area: 0.2 and more of the points, mostly
@@ -208,7 +207,7 @@ def _pair(clouds, centres, factor, motion: Rigid, protocol: Protocol) -> Pair:
     source, target = (Cloud(cloud.points * factor, cloud.count) for cloud in clouds)
     # Both were centred on their own: this is where the source stands in the target's frame.
     offset = (centres[0] - centres[1]) * factor
-    valid = [prefix_mask(len(cloud.points), cloud.count) for cloud in (source, target)]
+    valid = source.valid, target.valid
     near = squared_distances(source.points + offset[None, :], target.points)
     near = (near < protocol.overlap_radius**2) & valid[0][:, None] & valid[1][None, :]
     moved = rigid.apply(motion, source.points + offset[None, :])

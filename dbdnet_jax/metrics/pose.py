@@ -183,13 +183,13 @@ def pair_confusion(
     return Confusion(*(s + t for s, t in zip(source, target, strict=True)))
 
 
-def overlap_error(counts: Confusion) -> Float[Array, ""]:
+def overlap_error(counts: Confusion) -> Float[Array, "*pairs"]:
     """The share of points of the wrong class."""
     wrong = counts.false_positive + counts.false_negative
     return wrong / (wrong + counts.true_positive + counts.true_negative)
 
 
-def overlap_f1(counts: Confusion) -> Float[Array, ""]:
+def overlap_f1(counts: Confusion) -> Float[Array, "*pairs"]:
     """``2 TP / (2 TP + FP + FN)``; 0 where nothing is or is said to be overlapping."""
     wrong = counts.false_positive + counts.false_negative
     return 2 * counts.true_positive / jnp.maximum(2 * counts.true_positive + wrong, 1)

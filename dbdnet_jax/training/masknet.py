@@ -15,6 +15,7 @@ from dbdnet_jax.metrics.pose import overlap_error, overlap_f1, pair_confusion
 from dbdnet_jax.networks.batch_norm import split_batch_stats
 from dbdnet_jax.networks.masknet.network import MaskNet, MaskNetConfig, predict
 from dbdnet_jax.networks.params import Params
+from dbdnet_jax.networks.stacking import without_padding
 from dbdnet_jax.training.start import initial_params
 from dbdnet_jax.training.task import RunConfig, Task, check_stage
 from dbdnet_jax.types import Pair
@@ -61,7 +62,8 @@ def loss_of_batch(
 
     The authors train one direction only: their template is whole.
     """
-    points = pairs.source.points, pairs.target.points
+    # A NaN in the padding would reach the gradient through a weight of zero.
+    points = [without_padding(cloud).points for cloud in (pairs.source, pairs.target)]
     logits, changed = MaskNet(model).apply(
         {"params": trainable, "batch_stats": batch_stats},
         jnp.concatenate(points),

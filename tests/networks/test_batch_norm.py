@@ -97,7 +97,7 @@ def test_a_layer_used_twice_in_a_step_averages_twice():
     )
     mean = stats["a"]["batch_norm"]["mean"]
     for cloud in (x, y):
-        mapped = cloud @ layers["a"]["conv"]["kernel"] + layers["a"]["conv"]["bias"]
+        mapped = cloud @ layers["a"]["conv"]["kernel"] + layers["a"]["conv"]["bias"][None, :]
         mean = 0.9 * mean + 0.1 * mapped.mean(axis=0)
     np.testing.assert_allclose(
         changed["batch_stats"]["a"]["batch_norm"]["mean"], mean, rtol=1e-4, atol=1e-5

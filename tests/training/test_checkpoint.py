@@ -158,6 +158,7 @@ def test_load_best_says_what_is_missing_or_wrong(tmp_path):
     path.write_text("{")
     with pytest.raises(CheckpointError, match=r"readable stage\.json"):
         load_best(tmp_path)
+    path.write_text(json.dumps({"model": {}}))
     flip_a_bit(tmp_path / "registration" / "checkpoints" / "1")
     with pytest.raises(CheckpointError, match="checkpoints/1 is damaged"):
         load_best(tmp_path)

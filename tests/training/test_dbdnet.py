@@ -131,9 +131,9 @@ def test_weights_that_see_coordinates_only_go_on_with_local_geometry(run_dir, tm
     start = load_best(run_dir)
     save_params(weights, start)
     settings = dataclasses.replace(
-        SETTINGS,
-        model=dataclasses.replace(SETTINGS.model, local_geometry=2),
-        train=dataclasses.replace(SETTINGS.train, start=str(weights)),
+        CONFIG,
+        model=dataclasses.replace(CONFIG.model, local_geometry=2),
+        train=dataclasses.replace(CONFIG.train, start=str(weights)),
     )
     task = make_task(settings, "overlap", tmp_path)
     kernel = task.trainable["encoder"]["stage1_conv1"]["conv_0"]["kernel"]
@@ -145,12 +145,9 @@ def test_weights_that_see_coordinates_only_go_on_with_local_geometry(run_dir, tm
 
 
 def test_a_constant_rate_lets_a_run_be_prolonged(tmp_path):
-    settings = dataclasses.replace(
-        SETTINGS, train=dataclasses.replace(SETTINGS.train, decay_epochs=1.0)
-    )
-    longer = dataclasses.replace(
-        settings, overlap=dataclasses.replace(settings.overlap, epochs=4.0)
-    )
+    train = dataclasses.replace(CONFIG.train, schedule="constant", decay_epochs=1.0)
+    settings = dataclasses.replace(CONFIG, train=train)
+    longer = settings.with_stage("overlap", epochs=4.0)
     fit(settings, "overlap", tmp_path, source())
     fit(longer, "overlap", tmp_path, source())
     rows = (tmp_path / "overlap" / "train.csv").read_text().splitlines()

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 from dbdnet_jax.networks.batch_norm import DenseBatchNorm, dense_batch_norm_shapes, fold
 from dbdnet_jax.networks.blocks import Affine, affine_shapes
 from dbdnet_jax.networks.params import Params, Shapes
+from dbdnet_jax.networks.stacking import pool
 from dbdnet_jax.types import Answer, Cloud
 
 
@@ -65,10 +66,9 @@ class MaskNet(nn.Module):
                 x = layer(x, training)
             return x
 
-        seen = encode(source)
-        if source_valid is not None:
-            seen = jnp.where(source_valid[..., None], seen, 0.0)  # the floor of a ReLU
-        whole = jnp.max(seen, axis=-2)
+        if source_valid is None:
+            source_valid = jnp.ones(source.shape[:-1], bool)
+        whole = pool(encode(source), source_valid)
         x = encode(template)
         width = x.shape[-1]
         first, *rest = [
