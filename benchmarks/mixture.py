@@ -15,14 +15,15 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from dbdnet_jax.sources import VALIDATION_SEED
-from dbdnet_jax.weights import load_named
 
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.mixture import PARTS, make_part_pair, stock_of
 from dbdnet_jax.data.pairs import Protocol, make_pair
+from dbdnet_jax.data.training_pairs import VALIDATION_SEED
 from dbdnet_jax.data.worlds import OTHERS
-from dbdnet_jax.evaluation import evaluate_method, from_network
+from dbdnet_jax.evaluation.methods import Method, from_network
+from dbdnet_jax.evaluation.run import evaluate_method
+from dbdnet_jax.networks.weights import load_named
 from dbdnet_jax.types import Pair
 
 PROTOCOL_PAIRS = 194
@@ -67,9 +68,9 @@ def _stacked(pairs: list[Pair]) -> Drawn:
     return Drawn(stacked, hashlib.sha256(clouds.tobytes()).hexdigest()[:12])
 
 
-def row_of(params, pairs: Pair) -> str:
+def row_of(method: Method, pairs: Pair) -> str:
     """Errors, parts of the pairs that are right, and overlap of one set."""
-    row = evaluate_method("DBDNet", from_network(params), pairs)
+    row = evaluate_method(method, pairs)
     summary, errors = row.summary, row.errors
     assert summary is not None and summary.overlap is not None and errors is not None
     right = (errors.rotation_deg < 15) & (errors.translation < 0.2)
@@ -94,7 +95,7 @@ def main() -> None:
     options = parser.parse_args()
     sets = draw_sets(options.split, options.count)
     for name in options.weights:
-        params = load_named(name)
+        method = Method("DBDNet", from_network(load_named(name)))  # compiled once
         print(f"\n{name}, {options.split} shapes\n")
         print(
             "| part | sha256 | Error R | median R | Error t | % below 15 degrees and 0.2 | "
@@ -102,7 +103,7 @@ def main() -> None:
         )
         print("|---|---|---|---|---|---|---|---|---|")
         for part, drawn in sets.items():
-            print(f"| {part} | {drawn.digest} | {row_of(params, drawn.pairs)} |", flush=True)
+            print(f"| {part} | {drawn.digest} | {row_of(method, drawn.pairs)} |", flush=True)
 
 
 if __name__ == "__main__":
