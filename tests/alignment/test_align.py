@@ -213,7 +213,7 @@ def test_a_probability_is_a_logistic_of_standardised_evidence():
         return success_probability(PoseFeatures(*[value] * fields), Coefficients(unused, fitted))
 
     terms = fields * 0.5 * (3 - 1) / 2
-    assert probability(3) == pytest.approx(1 / (1 + np.exp(1 - terms)))
+    assert probability(3.0) == pytest.approx(1 / (1 + np.exp(1 - terms)))
     assert 0 < probability(-1e9) < LIKELY
     assert load_coefficients() == load_coefficients()  # the shipped file is whole
 
