@@ -69,7 +69,7 @@ BAD_FILES = {
     "words.xyz": (b"hello\nworld\n", r"no line has three numbers"),
     "two.csv": (b"1,2\n" * 40, r"no line has three numbers"),
     "word.csv": (b"1,2,3\n1,2,x\n", r"line 2 must have numbers as coordinates; got 'x'"),
-    "few.csv": (b"1,2,3\n4,5,7\n", r"source \(few\.csv\) must have at least 16 points; got 2"),
+    "few.csv": (b"7,2,3\n4,5,7\n", r"source \(few\.csv\) must have at least 16 points; got 2"),
     "image.csv": (b"\x89PNG\r\n\x1a\n" + bytes(99), r"no line has three numbers"),
     "half.npy": (npy(CLOUD)[:-99], r"half\.npy is not: "),
     "huge.npy": (
