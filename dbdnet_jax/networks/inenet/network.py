@@ -35,7 +35,7 @@ class INENetConfig:
     points: int = 717
     transform: tuple[int, ...] = (64, 128, 1024)
     transform_head: tuple[int, ...] = (512, 256)
-    encoder: tuple[int, int, int, int] = (64, 64, 128, 256)
+    encoder: tuple[int, ...] = (64, 64, 128, 256)
     features: int = 1024
     mask: tuple[int, ...] = (1024, 512, 128, 128)
     threshold: tuple[int, ...] = (512, 256, 128)

@@ -15,6 +15,7 @@ from dbdnet_jax.networks.dbdnet.register import predict_overlap, register_given_
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.ops.sampling import farthest_order
 from dbdnet_jax.training import dbdnet as stages
+from dbdnet_jax.training import dbdnet_tasks
 from dbdnet_jax.training.config import read_config
 from dbdnet_jax.types import Pair
 from tests import oracle
@@ -102,6 +103,10 @@ def test_farthest_point_sampling_has_no_hole_around_the_origin(x64):
     np.testing.assert_array_equal(order, oracle.farthest_order(points, N))
 
 
+class Asked(Exception):
+    """The registration network was asked."""
+
+
 def test_the_frozen_overlap_network_gets_no_key_for_dropout(tmp_path, monkeypatch):
     model = dataclasses.replace(SMALL, dropout=RATE)
     config = dataclasses.replace(read_config(modelnet.get_config()), model=model)
@@ -114,13 +119,15 @@ def test_the_frozen_overlap_network_gets_no_key_for_dropout(tmp_path, monkeypatc
 
     def registered(params, source, target, source_overlap, target_overlap, key=None):
         keys["registration"] = key
+        raise Asked  # what follows is of no interest here
 
-    monkeypatch.setattr(stages, "load_best", lambda run_dir, joint: Params({"overlap": {}}, model))
+    trained = Params({"overlap": {}}, model)
+    monkeypatch.setattr(dbdnet_tasks, "load_best", lambda run_dir, joint: trained)
     monkeypatch.setattr(stages, "predict_overlap_and_matches", predicted)
     monkeypatch.setattr(stages, "register_given_overlap", registered)
-    monkeypatch.setattr(stages, "registration_loss", lambda *_: None)
-    task = stages.make_task(config, "registration", tmp_path)
-    task.loss(task.trainable, task.frozen, Pair(*CLOUDS, *[None] * 5), jax.random.key(0))
+    task = dbdnet_tasks.registration_task(config, tmp_path)
+    with pytest.raises(Asked):
+        task.loss(task.trainable, task.frozen, Pair(*CLOUDS, *[None] * 5), jax.random.key(0))
     assert keys["overlap"] is None and keys["registration"] is not None
 
 
@@ -142,5 +149,5 @@ def test_every_departure_on_the_page_names_tests_that_exist():
     assert len(rows) > 10
     for row in rows:
         files, names = (re.findall(p, row) for p in (r"`(test_\w+\.py)`", r"`(test_\w+)`"))
-        written = "".join(next(TESTS.rglob(file)).read_text() for file in files)
+        written = "".join(path.read_text() for file in files for path in TESTS.rglob(file))
         assert names and all(f"def {name}(" in written for name in names), row
