@@ -171,7 +171,7 @@ def registered(pair: Pair):
     """What the networks answer, its loss and its errors."""
     answer = dbdnet.register_clouds(params(), pair.source, pair.target)
     loss = losses.registration_loss(answer, pair, losses.LossWeights())[0]
-    return of_registration(answer), loss, pose.registration_errors(answer, pair)
+    return of_registration(answer), loss, pose.motion_errors(answer.motion, pair.target_from_source)
 
 
 FUNCTIONS: dict[str, Callable[[Pair], object]] = {
@@ -189,7 +189,7 @@ FUNCTIONS: dict[str, Callable[[Pair], object]] = {
         em_icp.refine_from_rotations(p.source, p.target, rigid.identity(), (90.0,)).truncated_rmse
     ),
     "truncated_rmse": lambda p: em_icp.truncated_rmse(p.source, p.target, ROUGH),
-    "register_clouds registration_loss registration_errors": registered,
+    "register_clouds registration_loss": registered,
     "register_given_overlap": lambda p: of_registration(
         dbdnet.register_given_overlap(params(), p.source, p.target, *labels(p))
     ),

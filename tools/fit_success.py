@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from dbdnet_jax.alignment.align import MAX_POINTS, align
 from dbdnet_jax.alignment.candidates import Candidate, examine, far_starts, merged, near_starts
-from dbdnet_jax.alignment.finding import settle
+from dbdnet_jax.alignment.finding import settle, with_incumbent
 from dbdnet_jax.alignment.normalised import as_given, normalise_pair
 from dbdnet_jax.alignment.search import NetworkPose, predict_pose
 from dbdnet_jax.alignment.success import (
@@ -123,6 +123,8 @@ def judged(
     predicted = NetworkPose(np.array(record.network), *overlaps, nothing, nothing, nothing, True)
     near, far = (candidates(x, coefficients.rank) for x in (record.near, record.far))
     every = merged(near, far, middle=scene.source.surface.points.mean(axis=0))
+    sides = scene.source.surface, scene.target.surface
+    near, every = (with_incumbent(x, predicted, *sides, coefficients) for x in (near, every))
     for some, everywhere in ((near, False), (every, True)):
         found = settle(scene, some, predicted, coefficients, None, everywhere=everywhere)
         yield found.evidence, is_right(as_given(found.pose, scene), pair), everywhere

@@ -100,6 +100,13 @@ def merged(*lists: list[Candidate], middle: Float[np.ndarray, "3"]) -> list[Cand
     return [every[row] for row in rows]
 
 
+def different(
+    candidates: list[Candidate], other: Candidate, middle: Float[np.ndarray, "3"]
+) -> list[Candidate]:
+    """The candidates that are other poses than one."""
+    return [x for x in candidates if _differ(x.pose, other.pose, middle)]
+
+
 def choose(
     candidates: list[Candidate], guess: Transform | None, middle: Float[np.ndarray, "3"]
 ) -> int:

@@ -30,7 +30,7 @@ class Level(NamedTuple):
     schedule: em_icp.Schedule
 
 
-# Chosen on validation pairs of the embedded shapes turned by any rotation.
+# By judgement: radii that catch any rotation of the cube group, and points that are enough for it.
 COARSE = Level(256, 8, em_icp.Schedule(first=0.4, last=0.12, iterations=15, cap=0.15))
 FINE = Level(512, 4, em_icp.Schedule(first=0.16, last=0.06, iterations=12, cap=0.08))
 
@@ -84,9 +84,19 @@ def predict_pose(params: Params, source: Points, target: OtherPoints) -> Network
 
 def refine(pose: Transform, source: Points, target: OtherPoints) -> Transform:
     """The pose after `classical.refine`, which takes the first 1,024 points of each cloud."""
-    clouds = source[: em_icp.MOST_POINTS], target[: em_icp.MOST_POINTS]
-    rotation, translation, *_ = _run_em_icp(pose, *clouds)
+    rotation, translation, *_ = _run_em_icp(em_icp.refine, pose, source, target)
     return as_transform(rotation, translation)
+
+
+def refine_multistart(pose: Transform, source: Points, target: OtherPoints) -> Transform:
+    """The refined pose, or a refined turn of it that fits clearly better; as `refine`."""
+    rotation, translation, *_ = _run_em_icp(em_icp.refine_multistart, pose, source, target)
+    return as_transform(rotation, translation)
+
+
+def truncated_rmse(pose: Transform, source: Points, target: OtherPoints) -> float:
+    """How badly a pose fits, a length; see `classical.refine`."""
+    return float(_run_em_icp(em_icp.truncated_rmse, pose, source, target)[0])
 
 
 def refine_each(
@@ -118,15 +128,17 @@ def refine_each(
     return found, np.concatenate(residuals)
 
 
-def _run_em_icp(pose: Transform, source: Points, target: OtherPoints) -> list[np.ndarray]:
-    """The arrays that `classical.refine.refine` gives for the pose."""
+def _run_em_icp(
+    function: Callable, pose: Transform, source: Points, target: OtherPoints
+) -> list[np.ndarray]:
+    """The arrays that a function of `classical.refine` gives for the pose."""
 
-    def refine(source, target, start, cap):
-        refined = em_icp.refine(Cloud(*source), Cloud(*target), Rigid(*start), cap)
-        return tuple(jax.tree.leaves(refined))
+    def arrays(source, target, start, cap):
+        return tuple(jax.tree.leaves(function(Cloud(*source), Cloud(*target), Rigid(*start), cap)))
 
+    clouds = _pad(source[: em_icp.MOST_POINTS], target[: em_icp.MOST_POINTS])
     start = tuple(np.asarray(part, np.float32) for part in (pose[:3, :3], pose[:3, 3]))
-    return list(_run("refine", refine, *_pad(source, target), start, np.float32(em_icp.CAP)))
+    return list(_run(function.__name__, arrays, *clouds, start, np.float32(em_icp.CAP)))
 
 
 def _run(name: str, function: Callable, *arguments: Any) -> Any:
