@@ -18,7 +18,7 @@ class CoordinateEncoder(nn.Module):
     channels: int
     space: str
 
-    def __call__(self, points, pyramid):
+    def __call__(self, points, pyramid, geometry=None):
         """(n, 4 channels), as the encoder's."""
         return jnp.tile(points, (1, 2 * self.channels))[:, : 4 * self.channels]
 
