@@ -21,6 +21,11 @@ from tests.aligning import POINTS, pair, rotation_error_deg, tiny_align, tiny_pa
 
 ALIGN = importlib.import_module("dbdnet_jax.alignment.align")  # not the function
 EXAMPLES = Path(__file__).parents[1] / "examples"
+needs_report = pytest.mark.skipif(
+    not (find_spec("plotly") and find_spec("matplotlib")),
+    reason="the report extra is not installed",
+)
+PNG, HTML = b"\x89PNG\r\n", b"<!DOCTYPE html>"
 
 
 @pytest.fixture(scope="module")
@@ -203,12 +208,15 @@ def test_an_interrupt_leaves_no_file(run, tmp_path, monkeypatch, where, moment):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_full_disk_leaves_no_file(run, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("flag", "name"), [("-o", "t.txt"), pytest.param("--report", "r.html", marks=needs_report)]
+)
+def test_a_full_disk_leaves_no_file(run, tmp_path, monkeypatch, flag, name):
     def full(*_):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.fsync", full)
-    status, _, err = run("a.ply", "b.ply", "-o", tmp_path / "t.txt")
+    status, _, err = run("a.ply", "b.ply", flag, tmp_path / name)
     assert status == UNUSABLE and "No space left" in err
     assert not list(tmp_path.iterdir())
 
@@ -240,13 +248,6 @@ def test_the_examples_are_scans_of_one_shape():
     found = tiny_align(source, target, initial=true)
     assert rotation_error_deg(found.transform, true) < 3
     assert found.inlier_ratio > 0.5
-
-
-needs_report = pytest.mark.skipif(
-    not (find_spec("plotly") and find_spec("matplotlib")),
-    reason="the report extra is not installed",
-)
-PNG, HTML = b"\x89PNG\r\n", b"<!DOCTYPE html>"
 
 
 @needs_report
@@ -289,14 +290,3 @@ def test_a_missing_extra_is_said_before_any_work(run, monkeypatch, flag):
     monkeypatch.setattr(ALIGN, "align", lambda *_, **__: pytest.fail("worked"))
     status, _, err = run("a.ply", "b.ply", flag)
     assert status == UNUSABLE and 'pip install "dbdnet_jax[report]"' in err
-
-
-@needs_report
-def test_a_full_disk_leaves_no_page(run, tmp_path, monkeypatch):
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("os.fsync", full)
-    status, _, err = run("a.ply", "b.ply", "--report", tmp_path / "r.html")
-    assert status == UNUSABLE and "No space left" in err
-    assert not list(tmp_path.iterdir())

@@ -40,8 +40,8 @@ class Confidence(nn.Module):
                 x = layer(beside_neighbours(x), training)
             return x
 
-        of_source = encode(source)
-        difference = encode(correspondence) - of_source
+        of_correspondence = encode(correspondence)  # first, which the running averages tell
+        difference = of_correspondence - encode(source)
         branches = []
         for branch in ("weight", "value"):
             x = difference

@@ -43,6 +43,11 @@ def small_params(seed: int = 0, config: ModelConfig = SMALL, dtype=np.float64) -
     return cast(perturbed(init_params(jax.random.key(seed), config), seed), dtype)
 
 
+def overlap_alone(params: Params) -> Params:
+    """Without the registration network."""
+    return params.replace(networks={"overlap": params.overlap})
+
+
 def whole(points) -> Cloud:
     """A cloud without padding."""
     return Cloud(jnp.asarray(points), jnp.asarray(len(points)))

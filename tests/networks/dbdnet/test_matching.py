@@ -11,7 +11,7 @@ from dbdnet_jax.networks.dbdnet.register import predict_overlap_and_matches
 from dbdnet_jax.types import Cloud, Rigid
 from tests import oracle
 from tests.conftest import FLOAT64, assert_close, random_cloud
-from tests.networks.dbdnet.small import NETWORK, SMALL, padded, small_params
+from tests.networks.dbdnet.small import NETWORK, SMALL, overlap_alone, padded, small_params
 
 N, COUNTS, WIDTH = 9, (8, 6), 5
 VALID = [np.arange(N) < count for count in COUNTS]
@@ -60,7 +60,7 @@ def test_how_well_a_point_fits_is_its_mass_and_two_distances_after_the_motion(x6
 
 def test_matches_are_told_in_the_callers_frames_whatever_the_padding(x64):
     config = dataclasses.replace(SMALL, overlap_matching=True)
-    params = small_params(3, config).replace(registration=None)
+    params = overlap_alone(small_params(3, config))
     source, target = random_cloud(4, 30), random_cloud(5, 27)
     predict = jax.jit(predict_overlap_and_matches)
     *probabilities, matched = predict(params, padded(source, 40, 0.0), padded(target, 40, 0.0))
@@ -83,7 +83,7 @@ def test_a_second_pass_goes_on_from_the_motion_of_the_first(x64):
     two = dataclasses.replace(one, overlap_passes=2)
     clouds = padded(random_cloud(4, 30) + 1.0, 40, 0.0), padded(random_cloud(5, 27) - 2.0, 40, 0.0)
     predict = jax.jit(predict_overlap_and_matches)
-    params = small_params(3, one).replace(registration=None)
+    params = overlap_alone(small_params(3, one))
     first = predict(params, *clouds)[2].motion
     *probabilities, matched = predict(params, *clouds, start=first)
     *both, after = predict(params.replace(config=two), *clouds)

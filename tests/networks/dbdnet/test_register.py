@@ -19,7 +19,7 @@ from dbdnet_jax.ops import rigid
 from dbdnet_jax.types import Branch, Cloud, Registration, Rigid
 from tests import oracle
 from tests.conftest import EXACT, assert_close, random_cloud
-from tests.networks.dbdnet.small import NETWORK, SMALL, cast, small_params
+from tests.networks.dbdnet.small import NETWORK, SMALL, cast, overlap_alone, small_params
 
 N, COUNT, M = 64, 52, 49
 SOURCE, TARGET = random_cloud(0, COUNT), random_cloud(1, M)
@@ -199,7 +199,7 @@ def test_the_answer_has_the_type_of_the_clouds(dtype, x64):
 
 
 def test_overlap_parameters_alone_do_not_register(x64):
-    alone = small_params().replace(registration=None)
+    alone = overlap_alone(small_params())
     with pytest.raises(ValueError, match="needs a registration network.*predict_overlap"):
         register(alone, jnp.asarray(SOURCE), jnp.asarray(TARGET))
 
