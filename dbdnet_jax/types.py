@@ -7,7 +7,13 @@ Points are rows, features last. A cloud of static size n holds its valid points 
 from typing import NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+
+# What users give and get, on the host; two clouds of one function may differ in size.
+Points = Float[np.ndarray, "n 3"]
+OtherPoints = Float[np.ndarray, "m 3"]
+Transform = Float[np.ndarray, "4 4"]  # b_from_a
 
 
 class Cloud(NamedTuple):

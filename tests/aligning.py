@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from dbdnet_jax.alignment.align import align
 from dbdnet_jax.networks.initial import init_params
 from dbdnet_jax.networks.params import Params
+from dbdnet_jax.ops.transforms import transform_of
 from tests.networks.dbdnet.small import SMALL
 
 POINTS = 150  # one bucket, hence one compiled program, for every test
@@ -37,12 +38,9 @@ def solid(count: int, seed: int) -> np.ndarray:
 def motion(seed: int, degrees: float = 8.0, shift: float = 0.5) -> np.ndarray:
     """A 4x4 motion of an angle that refinement alone can bridge."""
     rng = np.random.default_rng(seed)
-    transform = np.eye(4)
     axis = rng.normal(size=3)
     turn = Rotation.from_rotvec(degrees * axis / np.linalg.norm(axis), degrees=True)
-    transform[:3, :3] = turn.as_matrix()
-    transform[:3, 3] = rng.uniform(-shift, shift, 3)
-    return transform
+    return transform_of(turn.as_matrix(), rng.uniform(-shift, shift, 3))
 
 
 def pair(count: int = 380, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

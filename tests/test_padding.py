@@ -132,7 +132,7 @@ def params():
 
 def labels(pair: Pair):
     """True labels as probabilities; what stands in the padding is garbage too."""
-    return pair.source_overlap * 1.0, pair.target_overlap * 1.0
+    return pair.source_overlap.astype(float), pair.target_overlap.astype(float)
 
 
 def perturbed_labels(pair: Pair):

@@ -36,12 +36,13 @@ from dbdnet_jax.alignment.success import (
     fit_features,
 )
 from dbdnet_jax.alignment.surfaces import PoseFit
-from dbdnet_jax.alignment.transforms import Transform, move, turn_deg
 from dbdnet_jax.data.frozen import cad_test_pairs
 from dbdnet_jax.io.files import write_atomic
 from dbdnet_jax.io.programs import keep_compiled_programs
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import load_named
+from dbdnet_jax.ops.transforms import move, turn_deg
+from dbdnet_jax.types import Transform
 from tools.scan_pairs import ScanPair, scan_pair
 
 VARIANTS = ("noise", "clean", "disjoint")  # of the frozen test pairs

@@ -15,6 +15,7 @@ from dbdnet_jax.alignment.writing import write_ply
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.pairs import Protocol, make_pair
 from dbdnet_jax.io.files import write_atomic
+from dbdnet_jax.ops.transforms import transform_of
 
 FOLDER = Path(__file__).parents[1] / "examples"
 SHAPE = "corner sofa"
@@ -29,9 +30,8 @@ def main() -> None:
     protocol = Protocol(noise_sigma=0.005 / RADIUS_M)
     pair = make_pair(jax.random.key(0), shapes.points[row], shapes.normals[row], protocol)
     pair = jax.tree.map(lambda x: np.asarray(x, np.float64), pair)
-    motion = np.eye(4)
-    motion[:3, :3] = pair.target_from_source.rotation
-    motion[:3, 3] = RADIUS_M * pair.target_from_source.translation + FRAME_M
+    rotation, translation = pair.target_from_source
+    motion = transform_of(rotation, RADIUS_M * translation + FRAME_M)
     FOLDER.mkdir(exist_ok=True)
     write_ply(FOLDER / "scan_a.ply", RADIUS_M * pair.source.points)
     write_ply(FOLDER / "scan_b.ply", RADIUS_M * pair.target.points + FRAME_M)

@@ -7,16 +7,15 @@ scattered outliers, a heap far away, an object on a floor, and dense clouds of p
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from dbdnet_jax.alignment.transforms import Transform, as_transform, move
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.procedural.shapes import procedural_solid
 from dbdnet_jax.data.surface import sample_surface
+from dbdnet_jax.ops.transforms import as_transform, move
+from dbdnet_jax.types import Points, Transform
 
 Rng = np.random.Generator
-Points = Float[np.ndarray, "n 3"]
 
 DENSE_PART, FLOOR_PART, CLUTTER_PART = 0.4, 0.25, 0.15
 PROCEDURAL = 7919  # of the seed: no solid that training draws

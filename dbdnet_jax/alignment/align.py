@@ -20,13 +20,14 @@ from dbdnet_jax.alignment.normalised import (
 )
 from dbdnet_jax.alignment.search import NetworkPose
 from dbdnet_jax.alignment.success import PoseFeatures, load_coefficients
-from dbdnet_jax.alignment.transforms import Transform, as_transform
 from dbdnet_jax.alignment.validity import rejection_reason, warnings
 from dbdnet_jax.io.forks import require_own_jax
 from dbdnet_jax.io.point_files import read_point_file
 from dbdnet_jax.io.programs import loading_seconds
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import load_pretrained
+from dbdnet_jax.ops.transforms import as_transform
+from dbdnet_jax.types import Transform
 
 SEARCHES = ("auto", "near", "any")
 LISTED = 1.0  # alternatives whose score, a logarithm of odds, is lower by less are listed

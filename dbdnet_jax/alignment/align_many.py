@@ -18,11 +18,11 @@ from dbdnet_jax.alignment.pose_graph import (
     in_source_frame,
     optimise,
 )
-from dbdnet_jax.alignment.transforms import as_transform, move
 from dbdnet_jax.errors import load_open3d
 from dbdnet_jax.io.point_files import read_points
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import load_pretrained
+from dbdnet_jax.ops.transforms import as_transform, move
 
 ALL_PAIRS = 12  # clouds of which all pairs are aligned unless others are asked for
 

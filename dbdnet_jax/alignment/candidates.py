@@ -9,7 +9,7 @@ from dbdnet_jax.alignment import search
 from dbdnet_jax.alignment.point_to_plane import refine_point_to_plane
 from dbdnet_jax.alignment.success import Coefficients, fit_score
 from dbdnet_jax.alignment.surfaces import PoseFit, Surface, inlier_distance, measure_fit
-from dbdnet_jax.alignment.transforms import (
+from dbdnet_jax.ops.transforms import (
     Transform,
     angle_between,
     as_transform,

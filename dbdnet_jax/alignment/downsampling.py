@@ -8,8 +8,9 @@ from jaxtyping import Float, Int
 
 from dbdnet_jax.alignment.outliers import inlying
 from dbdnet_jax.alignment.voxels import MAX_CELLS, first_of_cells, voxel_keys
+from dbdnet_jax.ops.sampling import farthest_rows
+from dbdnet_jax.types import Points
 
-Points = Float[np.ndarray, "n 3"]
 Rows = Int[np.ndarray, " k"]
 Fewer = Int[np.ndarray, " j"]
 Fewest = Int[np.ndarray, " i"]
@@ -53,7 +54,9 @@ def downsample(points: Points, sparse: int, dense: int = DENSE) -> Downsampled:
     else:  # in an order of their own
         rows = rows[np.lexsort(points[rows].T)]
     middle = points[rows].mean(axis=0)
-    even = farthest_rows(points[rows] - middle, max(EVEN, sparse))
+    offsets = points[rows] - middle
+    outermost = int((offsets**2).sum(axis=1).argmax())
+    even = farthest_rows(offsets, max(EVEN, sparse), outermost)
     chosen = rows[even[:sparse]]
     centre = points[chosen].mean(axis=0)
     size = np.quantile(np.linalg.norm(points[chosen] - centre, axis=1), 0.98)
@@ -80,20 +83,3 @@ def voxel_rows(points: Points, rows: Rows, middle: Float[np.ndarray, "3"], cell:
     """Of every occupied cell of a cubic grid the row nearest to the cell's middle."""
     offsets = points[rows] - middle
     return rows[first_of_cells(voxel_keys(offsets, cell), offsets, cell)]
-
-
-def farthest_rows(points: Points, count: int) -> Rows:
-    """Rows of ``count`` farthest-point samples, first the one farthest from the origin.
-
-    Fewer where only copies of the chosen points are left.
-    """
-    columns = np.ascontiguousarray(points.T)
-    distance = np.full(len(points), np.inf)
-    row = int((columns**2).sum(axis=0).argmax())
-    chosen: list[int] = []
-    while len(chosen) < count and distance[row] > 0:
-        chosen.append(row)
-        step = columns - columns[:, row, None]
-        np.minimum(distance, np.einsum("ij,ij->j", step, step), out=distance)
-        row = int(distance.argmax())
-    return np.array(chosen)

@@ -29,8 +29,9 @@ from dbdnet_jax.alignment.success import (
     success_probability,
 )
 from dbdnet_jax.alignment.surfaces import Surface, inlier_distance, measure_fit, surface
-from dbdnet_jax.alignment.transforms import Transform, angle_between, move
 from dbdnet_jax.networks.params import Params
+from dbdnet_jax.ops.transforms import angle_between, move
+from dbdnet_jax.types import Transform
 
 LIKELY = 0.5  # success probability of a valid pose
 CONFIDENT = 0.9  # of a pose near the given orientation: no other rotations are searched

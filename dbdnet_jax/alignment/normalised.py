@@ -7,11 +7,9 @@ from jaxtyping import Float
 
 from dbdnet_jax.alignment.downsampling import UNIT_SIZE, Downsampled, downsample
 from dbdnet_jax.alignment.surfaces import Surface, surface
-from dbdnet_jax.alignment.transforms import Transform, as_transform, move
 from dbdnet_jax.io.point_files import MIN_POINTS
-
-Points = Float[np.ndarray, "n 3"]
-OtherPoints = Float[np.ndarray, "m 3"]
+from dbdnet_jax.ops.transforms import as_transform, move
+from dbdnet_jax.types import OtherPoints, Points, Transform
 
 
 class NormalisedCloud(NamedTuple):
@@ -58,7 +56,7 @@ def normalise_pair(
             f"{UNIT_SIZE:g}; scale={factor:g} makes {size * factor:g} of {size:g}. Use 'auto'."
         )
 
-    def side(points, rows, turn):
+    def side(points: np.ndarray, rows: Downsampled, turn: np.ndarray) -> NormalisedCloud:
         dense = (points[rows.dense] - rows.centre) @ turn.T * factor
         sparse = dense[rows.even[: len(rows.sparse)]]
         return NormalisedCloud(points, rows, surface(dense, rows.even), sparse)

@@ -8,11 +8,10 @@ for clusters that stand apart. Nothing here depends on the order of the points.
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 
 from dbdnet_jax.alignment.voxels import MAX_CELLS, first_of_cells, voxel_keys
-
-Points = Float[np.ndarray, "n 3"]
+from dbdnet_jax.types import Points
 
 BULK = 0.8  # part of the points that are taken for granted
 FARTHEST = 20.0  # from the median, per distance that holds the bulk: beyond lie sentinels

@@ -3,8 +3,9 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from dbdnet_jax.alignment.surfaces import Surface, Transform
-from dbdnet_jax.alignment.transforms import as_transform, move
+from dbdnet_jax.alignment.surfaces import Surface
+from dbdnet_jax.ops.transforms import as_transform, move, transform_of
+from dbdnet_jax.types import Transform
 
 FEWEST = 12  # matched points of a step
 ROBUST = 2.0  # residuals above this many medians count little (Geman & McClure)
@@ -64,7 +65,5 @@ def _step(
     turn, shift = np.split(-np.linalg.solve(held, weighted.T @ residual), 2)
     from scipy.spatial.transform import Rotation
 
-    step = np.eye(4)
-    step[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
-    step[:3, 3] = pivot + shift - step[:3, :3] @ pivot
-    return step
+    rotation = Rotation.from_rotvec(turn).as_matrix()
+    return transform_of(rotation, pivot + shift - rotation @ pivot)

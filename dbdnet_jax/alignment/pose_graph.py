@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dbdnet_jax.alignment.transforms import Transform, angle_between, as_transform, move
+from dbdnet_jax.ops.transforms import angle_between, as_transform, move
+from dbdnet_jax.types import Transform
 
 PRUNED = 0.25  # Open3D's confidence (1 + d^2)^-2 at a disagreement d of 1
 # Open3D measures a rotation by its sine, which a half turn brings back to 0.

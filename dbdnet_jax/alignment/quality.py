@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from dbdnet_jax.alignment.surfaces import Surface
+from dbdnet_jax.types import Points
 
-Points = Float[np.ndarray, "n 3"]
 Direction = Float[np.ndarray, "3"]
 
 # A motion is free when it changes the distances between the surfaces by less than this part of

@@ -9,15 +9,14 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from dbdnet_jax.alignment.surfaces import Surface
-from dbdnet_jax.alignment.transforms import Transform, as_transform
 from dbdnet_jax.classical import refine as em_icp
 from dbdnet_jax.io.programs import load_or_trace
 from dbdnet_jax.networks.dbdnet.register import register_clouds
 from dbdnet_jax.networks.params import Params
-from dbdnet_jax.types import Cloud, Rigid
+from dbdnet_jax.ops.transforms import as_transform
+from dbdnet_jax.types import Cloud, OtherPoints, Points, Rigid, Transform
 
-Points = Float[np.ndarray, "n 3"]
-OtherPoints = Float[np.ndarray, "m 3"]
+Arrays = tuple[Any, ...]  # of arrays, or of such tuples: all that a kept program takes and gives
 
 SMALLEST_BUCKET = 192
 
@@ -53,7 +52,7 @@ def predict_pose(params: Params, source: Points, target: OtherPoints) -> Network
     """Register two clouds of any size; programs are compiled for a few sizes only."""
     config = params.config
 
-    def network(weights, source, target):
+    def network(weights: Any, source: Arrays, target: Arrays) -> Arrays:
         weights = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), weights)
         answer = register_clouds(Params(weights, config), Cloud(*source), Cloud(*target))
         branches = answer.rotation_branch, answer.translation_branch
@@ -104,7 +103,7 @@ def refine_each(
 ) -> tuple[list[Transform], Float[np.ndarray, " k"]]:
     """Poses refined, each for itself, on the first even points, and their truncated RMSE."""
 
-    def run(source, target, normals, starts):
+    def run(source: Arrays, target: Arrays, normals: Arrays, starts: Arrays) -> Arrays:
         clouds = Cloud(*source), Cloud(*target)
         poses, rmse = em_icp.refine_each(*clouds, normals, Rigid(*starts), level.schedule)
         return poses.rotation, poses.translation, rmse
@@ -133,7 +132,7 @@ def _run_em_icp(
 ) -> list[np.ndarray]:
     """The arrays that a function of `classical.refine` gives for the pose."""
 
-    def arrays(source, target, start, cap):
+    def arrays(source: Arrays, target: Arrays, start: Arrays, cap: jax.Array) -> Arrays:
         return tuple(jax.tree.leaves(function(Cloud(*source), Cloud(*target), Rigid(*start), cap)))
 
     clouds = _pad(source[: em_icp.MOST_POINTS], target[: em_icp.MOST_POINTS])

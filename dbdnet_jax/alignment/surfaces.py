@@ -8,9 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-Points = Float[np.ndarray, "n 3"]
-OtherPoints = Float[np.ndarray, "m 3"]
-Transform = Float[np.ndarray, "4 4"]
+from dbdnet_jax.types import Points, Transform
 
 NEAREST_INLIER = 0.03  # of the unit: noise and the last error of a pose, for dense clouds
 NORMAL_NEIGHBOURS = 16  # at least; of dense clouds a 500th part, to reach beyond their noise
@@ -84,7 +82,12 @@ def measure_fit(pose: Transform, source: Surface, target: Surface, distance: flo
     )
 
 
-def _tight(near: Bool[np.ndarray, " e"], cosine, plane, distance: float):
+def _tight(
+    near: Bool[np.ndarray, " e"],
+    cosine: Float[np.ndarray, " e"],
+    plane: Float[np.ndarray, " e"],
+    distance: float,
+) -> Float[np.ndarray, " e"]:
     """Weight of every point as one that lies on the other surface."""
     weight = np.exp(-0.5 * (plane / (TIGHT * distance)) ** 2)
     return np.where(near & (cosine > SAME_SIDE), weight, 0.0)

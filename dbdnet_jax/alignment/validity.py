@@ -8,7 +8,7 @@ from jaxtyping import Float
 from dbdnet_jax.alignment.finding import LIKELY, Found
 from dbdnet_jax.alignment.normalised import NormalisedPair, size_ratio
 from dbdnet_jax.alignment.quality import in_words, written
-from dbdnet_jax.alignment.transforms import angle_between
+from dbdnet_jax.ops.transforms import angle_between
 
 LOW_OVERLAP, NO_OVERLAP = 0.3, 0.1  # inlier ratios that give a warning, and no valid pose
 UNEQUAL, INCOMPATIBLE = 2.0, 4.0  # sizes of the clouds that do the same

@@ -14,10 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from dbdnet_jax.errors import load_open3d
-from dbdnet_jax.types import Rigid
-
-Points = Float[np.ndarray, "n 3"]
-OtherPoints = Float[np.ndarray, "m 3"]
+from dbdnet_jax.ops.transforms import transform_of
+from dbdnet_jax.types import OtherPoints, Points, Rigid
 
 ICP_DISTANCE = 1.0  # wide: the clouds start up to 1.7 apart
 ICP_CENTRED_DISTANCE = 0.2
@@ -49,9 +47,8 @@ def icp_centred(source: Points, target: OtherPoints) -> Rigid:
     Raises:
         MissingExtraError: Open3D is absent.
     """
-    start = np.eye(4)
-    start[:3, 3] = target.mean(0, dtype=np.float64) - source.mean(0, dtype=np.float64)
-    return _icp(source, target, start, ICP_CENTRED_DISTANCE)
+    shift = target.mean(0, dtype=np.float64) - source.mean(0, dtype=np.float64)
+    return _icp(source, target, transform_of(np.eye(3), shift), ICP_CENTRED_DISTANCE)
 
 
 def fgr(

@@ -18,7 +18,7 @@ from dbdnet_jax.ops import rigid
 from dbdnet_jax.ops.grouping import squared_distances
 from dbdnet_jax.ops.normals import estimate_normals
 from dbdnet_jax.ops.rigid import HIGHEST
-from dbdnet_jax.ops.sampling import prefix_mask
+from dbdnet_jax.ops.sampling import divisor, prefix_mask
 from dbdnet_jax.types import Cloud, Rigid
 
 # Chosen on validation pairs of the embedded shapes, with noise and with disjoint draws.
@@ -180,7 +180,7 @@ def _zero_padding(cloud: Cloud) -> Cloud:
 def _middle(points: Float[Array, "n 3"], cloud: Cloud) -> Float[Array, "3"]:
     """The mean of the valid rows of ``points``."""
     total = jnp.sum(jnp.where(cloud.valid[:, None], points, 0.0), axis=0)
-    return total / jnp.maximum(cloud.count, 1)
+    return total / divisor(cloud.count, total.dtype)
 
 
 def _turned(source: Cloud, pose: Rigid, angles_deg: tuple[float, ...]) -> Rigid:
@@ -196,7 +196,7 @@ def _turned(source: Cloud, pose: Rigid, angles_deg: tuple[float, ...]) -> Rigid:
     there, back = Rigid(identity, -middle), Rigid(identity, middle)
     level = rigid.compose(there, pose)
 
-    def about_middle(turn):
+    def about_middle(turn: Array) -> Rigid:
         return rigid.compose(back, rigid.compose(Rigid(turn, jnp.zeros_like(middle)), level))
 
     return jax.vmap(about_middle)(turns)
@@ -224,8 +224,8 @@ def _truncated_rmse(
     squares = jnp.where(rows[:, None] & columns[None, :], squares, jnp.inf)
     squares = jnp.minimum(squares, jnp.square(cap))
     ways = jnp.where(rows, squares.min(axis=1), 0.0), jnp.where(columns, squares.min(axis=0), 0.0)
-    total = sum(jnp.sum(way) for way in ways)
-    return jnp.sqrt(total / jnp.maximum(source.count + target.count, 1))
+    total = jnp.sum(ways[0]) + jnp.sum(ways[1])
+    return jnp.sqrt(total / divisor(source.count + target.count, total.dtype))
 
 
 def _step(scene: _PreparedPair, motion: Rigid, radius: Float[Array, ""]) -> Rigid:

@@ -44,7 +44,7 @@ def make_augmented_pair(
     kept = LEAST_KEPT + (1 - LEAST_KEPT) * chance[2]
     drawn = jnp.minimum(protocol.size / kept, jnp.where(disjoint, total // 2, total))
 
-    def crop(key, rows):
+    def crop(key: PRNGKeyArray, rows: Array) -> Array:
         side_key, style_key = jax.random.split(key)
         args = points[rows], random_direction(side_key), protocol.size, drawn
         by_plane = jax.random.uniform(style_key) < 0.5

@@ -18,7 +18,7 @@ class DataConfig:
     augment: float = 0.0  # share of the training pairs under other conditions than the protocol's
     mixture: Mixture = Mixture()  # shares of pairs as the world is; ``augment`` is of the others
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse an unknown data set."""
         if self.name not in DATA_SETS:
             raise ValueError(

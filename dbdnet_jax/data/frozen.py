@@ -95,7 +95,7 @@ def load_test_set(path: str | Path, shapes: Shapes) -> tuple[Pair, str]:
         )
 
     @jax.jit
-    def pair(draw, points, normals):
+    def pair(draw: PairDraw, points: jax.Array, normals: jax.Array) -> Pair:
         return assemble(draw, points, normals, radius)
 
     pairs = [

@@ -16,6 +16,7 @@ from dbdnet_jax.data.scans import Seen, centred_cloud, cut, noisy, sample, share
 from dbdnet_jax.data.worlds import OTHERS, Surface, World, draw_world
 from dbdnet_jax.ops import rigid
 from dbdnet_jax.ops.grouping import squared_distances
+from dbdnet_jax.ops.quaternion import rotation_from_quaternion
 from dbdnet_jax.types import Cloud, Pair, Rigid
 
 LEAST_SHARED = 0.15  # of the smaller view, by area: 0.2 and more of the points, mostly
@@ -36,7 +37,7 @@ class Mixture:
     rooms: float = 0.0  # floor, walls and several shapes, seen from within
     turned: float = 0.0  # one shape, cut, turned by any rotation
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse shares that are none."""
         shares = dataclasses.astuple(self)
         if min(shares) < 0 or sum(shares) > 1:
@@ -145,7 +146,9 @@ def make_part_pair(
     return _pair(clouds, centres, factor, motion, protocol)
 
 
-def _between(key, points, near) -> Float[Array, "n 3"]:
+def _between(
+    key: PRNGKeyArray, points: Float[Array, "n 3"], near: Int[Array, " n"]
+) -> Float[Array, "m 3"]:
     """The points, and as many again between each one and a near one."""
     share = jax.random.uniform(key, (len(points), 1), minval=0.3, maxval=0.7)
     return jnp.concatenate([points, points + share * (points[near] - points)])
@@ -162,13 +165,13 @@ def _two_views(
     widest = jnp.where(part.world.walls > 0, math.pi / 5, math.pi)
     middle = jax.random.uniform(middle_key, (), minval=-1.0) * widest
 
-    def see(k, about):
+    def see(k: PRNGKeyArray, about: Array) -> Seen:
         pictured, part_of = view(k, surface, about, part.inside), cut(k, surface)
         return jax.tree.map(lambda a, b: jnp.where(by_camera, a, b), pictured, part_of)
 
     first = see(first_key, middle)
 
-    def attempt(k):
+    def attempt(k: PRNGKeyArray) -> tuple[Seen, Array]:
         about_key, k = jax.random.split(k)
         second = see(k, middle + apart * jax.random.uniform(about_key, (), minval=-1.0))
         return second, shared(first, second, surface)
@@ -193,16 +196,16 @@ def _motion(key: PRNGKeyArray, protocol: Protocol, turned: Bool[Array, ""]) -> R
 def any_rotation(key: PRNGKeyArray) -> Float[Array, "3 3"]:
     """A rotation, uniform over all: that of a random unit quaternion (Shoemake 1992)."""
     quaternion = jax.random.normal(key, (4,))
-    a, b, c, d = quaternion / jnp.linalg.norm(quaternion)
-    rows = [
-        [1 - 2 * (c * c + d * d), 2 * (b * c - a * d), 2 * (b * d + a * c)],
-        [2 * (b * c + a * d), 1 - 2 * (b * b + d * d), 2 * (c * d - a * b)],
-        [2 * (b * d - a * c), 2 * (c * d + a * b), 1 - 2 * (b * b + c * c)],
-    ]
-    return jnp.stack([jnp.stack(row) for row in rows])
+    return rotation_from_quaternion(quaternion / jnp.linalg.norm(quaternion))
 
 
-def _pair(clouds, centres, factor, motion: Rigid, protocol: Protocol) -> Pair:
+def _pair(
+    clouds: list[Cloud],
+    centres: list[Array],
+    factor: Float[Array, ""],
+    motion: Rigid,
+    protocol: Protocol,
+) -> Pair:
     """Both clouds at one scale, the source moved from the target's frame, and what overlaps."""
     source, target = (Cloud(cloud.points * factor, cloud.count) for cloud in clouds)
     # Both were centred on their own: this is where the source stands in the target's frame.

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from dbdnet_jax.ops import rigid
 from dbdnet_jax.ops.grouping import squared_distances
-from dbdnet_jax.ops.sampling import half_space_crop, random_direction, resample
+from dbdnet_jax.ops.sampling import divisor, half_space_crop, random_direction, resample
 from dbdnet_jax.types import Cloud, Pair, Rigid
 
 
@@ -31,7 +31,7 @@ class Protocol:
     disjoint: bool = False  # no point of the shape in both clouds: no exact counterparts
     overlap_radius: float = 0.1  # a point overlaps when the other cloud comes closer than this
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse what cannot be drawn."""
         if self.size < 4:
             raise ValueError(
@@ -209,4 +209,4 @@ def _overlap_labels(
 def _centroid(cloud: Cloud) -> Float[Array, "3"]:
     """The mean of the valid points."""
     points = jnp.where(cloud.valid[:, None], cloud.points, 0.0)
-    return jnp.sum(points, axis=0) / jnp.maximum(cloud.count, 1)
+    return jnp.sum(points, axis=0) / divisor(cloud.count, points.dtype)

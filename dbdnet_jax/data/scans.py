@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from dbdnet_jax.data.worlds import Surface
 from dbdnet_jax.ops import rigid
-from dbdnet_jax.ops.sampling import farthest_order, prefix_mask, random_direction
+from dbdnet_jax.ops.sampling import divisor, farthest_order, prefix_mask, random_direction
 from dbdnet_jax.types import Cloud
 
 CELLS = 48  # of the depth buffer, along each side of an image of 90 degrees
@@ -44,12 +44,12 @@ def cut(key: PRNGKeyArray, surface: Surface) -> Seen:
     kept = LEAST_KEPT + (MOST_KEPT - LEAST_KEPT) * keep
     # Of equal areas a point may stand for; where they differ the part kept differs a little.
     rank = jnp.sort(score)[::-1]
-    last = rank[jnp.maximum(jnp.round(kept * jnp.sum(there)).astype(int) - 1, 0)]
+    last = rank[jnp.maximum(jnp.round(kept * jnp.sum(there).astype(kept.dtype)).astype(int) - 1, 0)]
     return Seen(jnp.where(score >= last, surface.area, 0.0), centre + 3.0 * size * way)
 
 
 def view(
-    key: PRNGKeyArray, surface: Surface, about: Float[Array, ""], inside: Float[Array, ""]
+    key: PRNGKeyArray, surface: Surface, about: Float[Array, ""], inside: Float[Array, ""] | float
 ) -> Seen:
     """What a camera at azimuth ``about`` (radians from between x and z) sees of the surface.
 
@@ -130,17 +130,21 @@ def noisy(
     return points + jnp.clip(math.sqrt(0.5) * sigma * (sides + sight), -clip, clip)
 
 
-def centred_cloud(points: Float[Array, "n 3"], count: Int[Array, ""]):
+def centred_cloud(
+    points: Float[Array, "n 3"], count: Int[Array, ""]
+) -> tuple[Cloud, Float[Array, "3"], Float[Array, ""]]:
     """The cloud about its own centre, that centre, and within what 98 % of it lie."""
     valid = prefix_mask(len(points), count)
-    total = jnp.maximum(count, 1)
+    total = divisor(count, points.dtype)
     centre = jnp.sum(jnp.where(valid[:, None], points, 0.0), axis=0) / total
     points = jnp.where(valid[:, None], points - centre[None, :], 0.0)
     away = jnp.sort(jnp.where(valid, jnp.linalg.norm(points, axis=1), jnp.inf))
     return Cloud(points, count), centre, away[(0.98 * (total - 1)).astype(int)]
 
 
-def _image(points, eye, aim):
+def _image(
+    points: Float[Array, "n 3"], eye: Float[Array, "3"], aim: Float[Array, "3"]
+) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
     """Depth along the line of sight, and tangents to the side and upward; y is up."""
     forward = (aim - eye) / jnp.maximum(jnp.linalg.norm(aim - eye), 1e-6)
     side = jnp.stack([-forward[2], 0.0 * forward[1], forward[0]])
@@ -151,7 +155,12 @@ def _image(points, eye, aim):
     return depth, x / safe, y / safe
 
 
-def _unhidden(depth, x, y, there) -> Bool[Array, " n"]:
+def _unhidden(
+    depth: Float[Array, " n"],
+    x: Float[Array, " n"],
+    y: Float[Array, " n"],
+    there: Bool[Array, " n"],
+) -> Bool[Array, " n"]:
     """In front of the camera, within its image, and near the first thing of its cell."""
     wide = math.tan(math.radians(40))
     there = there & (depth > 0.05) & (jnp.abs(x) < wide) & (jnp.abs(y) < wide)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
-
 import numpy as np
 from jaxtyping import Float, Int
+
+from dbdnet_jax.ops.sampling import farthest_rows
 
 CANDIDATES = 3072  # drawn by area; farthest-point sampling then keeps KEPT of them
 KEPT = 2048
@@ -25,7 +25,7 @@ def even_points(
         ValueError: no triangle has an area.
     """
     points, normals = sample_surface(vertices, triangles, CANDIDATES, rng)
-    rows = np.sort(farthest_points(points, KEPT))
+    rows = np.sort(farthest_rows(points, KEPT))
     points, normals = points[rows], normals[rows]
     points = points - points.mean(0)
     return points / np.sqrt((points**2).sum(-1).max()), normals
@@ -65,30 +65,3 @@ def sample_surface(
         (1 - root) * first[face] + root * (1 - along) * second[face] + root * along * third[face]
     )
     return points, normals[face]
-
-
-def farthest_points(points: Float[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, " count"]:
-    """Rows chosen by farthest-point sampling from row 0, in the order of choice.
-
-    A choice changes the distances of points nearer than the largest distance left, so only a
-    window of the points, sorted along their longest axis, is looked at: half the time.
-    """
-    axis = int(np.ptp(points, axis=0).argmax())
-    order = np.argsort(points[:, axis], kind="stable")
-    coordinates = np.ascontiguousarray(points[order].T)
-    columns = points[order][:, :, None]
-    along = coordinates[axis].tolist()
-    nearest = np.full(len(points), np.inf)
-    last, reach = int(np.flatnonzero(order == 0)[0]), np.inf
-    chosen = np.empty(count, dtype=np.int64)
-    for step in range(count):
-        chosen[step] = last
-        low = bisect_left(along, along[last] - reach)
-        window = slice(low, bisect_right(along, along[last] + reach, lo=low))
-        offset = coordinates[:, window] - columns[last]
-        offset *= offset
-        distance = offset[0] + offset[1] + offset[2]
-        np.minimum(nearest[window], distance, out=nearest[window])
-        last = int(nearest.argmax())
-        reach = float(nearest[last]) ** 0.5
-    return order[chosen]

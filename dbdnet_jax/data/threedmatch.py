@@ -21,6 +21,7 @@ from jaxtyping import Bool, Float
 
 from dbdnet_jax.data.overlap import nearest_within, overlap_labels
 from dbdnet_jax.io.torch_pickle import load_pickle, load_torch
+from dbdnet_jax.ops.transforms import nearest_rotation
 from dbdnet_jax.types import Cloud, Pair, Rigid
 
 INFO_FILES = {  # the first name that is there; the second is the name in Predator's repository
@@ -136,9 +137,9 @@ def _numbers(
         )
     translation = translation.reshape(pairs, 3)
     finite = np.isfinite(rotation).all((1, 2)) & np.isfinite(translation).all(1)
-    left, scales, right = np.linalg.svd(np.where(np.isfinite(rotation), rotation, 0.0))
-    nearest = left @ right
-    rigid = (np.abs(scales - 1) < MAX_ROTATION_DEFECT).all(1) & (np.linalg.det(nearest) > 0)
+    known = np.where(np.isfinite(rotation), rotation, 0.0)
+    nearest = nearest_rotation(known)
+    rigid = np.linalg.norm(known - nearest, ord=2, axis=(1, 2)) < MAX_ROTATION_DEFECT
     if not (finite & rigid).all():
         row = np.argmin(finite & rigid)
         raise ValueError(

@@ -63,7 +63,9 @@ def draw_world(
     return Surface(*(jnp.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
 
-def _planes(key, parts, world, chance) -> list[Surface]:
+def _planes(
+    key: PRNGKeyArray, parts: list[Surface], world: World, chance: Float[Array, "5"]
+) -> list[Surface]:
     """The floor through the lowest points, a wall behind in x and another in z."""
     there = [part.area[0] > 0 for part in parts]
     ends = [jnp.max(jnp.abs(part.points[:, ::2])) for part in parts]

@@ -3,7 +3,6 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
 
 from dbdnet_jax.alignment.align import Alignment
 from dbdnet_jax.alignment.quality import written
@@ -11,9 +10,7 @@ from dbdnet_jax.drawing import figures
 from dbdnet_jax.drawing.page import Plot, render
 from dbdnet_jax.drawing.selection import DrawnPair, select_points
 from dbdnet_jax.drawing.style import SOURCE, TARGET
-
-Points = Float[np.ndarray, "n 3"]
-OtherPoints = Float[np.ndarray, "m 3"]
+from dbdnet_jax.types import OtherPoints, Points
 
 
 class CloudRow(NamedTuple):

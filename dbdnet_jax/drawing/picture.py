@@ -9,9 +9,8 @@ from jaxtyping import Float
 from dbdnet_jax.alignment.align import Alignment
 from dbdnet_jax.drawing.selection import box, select_points
 from dbdnet_jax.drawing.style import BAD, GOOD, OVERLAP, SOURCE, TARGET
+from dbdnet_jax.types import OtherPoints, Points
 
-Points = Float[np.ndarray, "n 3"]
-OtherPoints = Float[np.ndarray, "m 3"]
 INCHES, DOTS = (15.0, 5.6), 100  # 1500 x 560 pixels
 
 

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 
 from dbdnet_jax.alignment.align import Alignment
 from dbdnet_jax.alignment.downsampling import downsample
-from dbdnet_jax.alignment.transforms import move
+from dbdnet_jax.ops.transforms import move
 
 MATCHES_DRAWN = 60  # more lines hide each other
 APART = 2.0  # clouds farther apart than this many of their sizes are small dots in one picture

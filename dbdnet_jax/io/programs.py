@@ -7,6 +7,7 @@ import time
 import zlib
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
 import jaxlib
@@ -65,7 +66,7 @@ def require_device() -> None:
         ) from error
 
 
-def load_or_trace(function: Callable, name: str, *arguments) -> Callable:
+def load_or_trace(function: Callable, name: str, *arguments: Any) -> Callable:
     """``function`` compiled for arguments like these, through a file where JAX keeps its programs.
 
     That is ``jax_compilation_cache_dir``; where it is not set, without one. ``arguments`` and

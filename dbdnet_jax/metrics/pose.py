@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from dbdnet_jax.ops import rigid
 from dbdnet_jax.ops.grouping import squared_distances
 from dbdnet_jax.ops.rigid import HIGHEST
+from dbdnet_jax.ops.sampling import divisor
 from dbdnet_jax.types import Pair, Rigid
 
 GIMBAL_COSINE = 1e-6  # below: x and z turn about one axis; float32 cannot tell them apart
@@ -164,7 +165,8 @@ def point_distance(predicted: Rigid, pair: Pair) -> Float[Array, ""]:
             axis=1,
         ),
     )
-    return jnp.sum(jnp.where(rows, jnp.sqrt(nearest), 0.0)) / jnp.maximum(jnp.sum(rows), 1)
+    total = jnp.sum(jnp.where(rows, jnp.sqrt(nearest), 0.0))
+    return total / divisor(jnp.sum(rows), total.dtype)
 
 
 def _scored(predicted: Rigid, truth: Rigid) -> tuple[Rigid, Bool[Array, ""]]:

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from dbdnet_jax.networks.params import Shapes
 from dbdnet_jax.ops.attention import attention
 from dbdnet_jax.ops.grouping import interpolate, max_over_neighbours
+from dbdnet_jax.ops.sampling import divisor
 
 Layers = tuple[tuple[int, int], ...]  # (features, groups of the norm) of each layer
 
@@ -59,7 +60,7 @@ class Norm(nn.Module):
     features: int
     groups: int
 
-    def setup(self):
+    def setup(self) -> None:
         """Declare both."""
         self.scale = self.param("scale", nn.initializers.ones, (self.features,))
         self.bias = self.param("bias", nn.initializers.zeros, (self.features,))
@@ -99,7 +100,7 @@ class DenseNorm(nn.Module):
     def __call__(self, x: Float[Array, "n c"], valid: Bool[Array, " n"]) -> Float[Array, "n d"]:
         """Map, normalise, rectify; rows that are not valid enter no statistic."""
         x = dense(Affine(self.features, name="conv"), x)
-        weight = valid.astype(x.dtype) / jnp.maximum(jnp.sum(valid), 1).astype(x.dtype)
+        weight = valid.astype(x.dtype) / divisor(jnp.sum(valid), x.dtype)
         mean = weight @ x
         centred = jnp.where(valid[:, None], x - mean[None, :], 0.0)
         norm = Norm(self.features, self.groups, name="norm")
@@ -122,7 +123,7 @@ class Exchange(nn.Module):
 
     features: int
 
-    def setup(self):
+    def setup(self) -> None:
         """Declare the affine map."""
         self.conv = Affine(self.features)
 

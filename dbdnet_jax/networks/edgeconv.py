@@ -22,8 +22,13 @@ from jaxtyping import Array, Bool, Float, Int
 from dbdnet_jax.networks.blocks import LEAKY_SLOPE, Affine, Norm, affine_shapes, norm_shapes
 from dbdnet_jax.networks.params import Shapes
 from dbdnet_jax.ops.grouping import max_over_slots
+from dbdnet_jax.ops.sampling import divisor
 
 BLOCK_VALUES = 1 << 17  # of one block's edges, k x rows x channels: 512 KB of float32
+
+
+Moments = tuple[Array, Array]  # sums per channel (c,) of edges and of their squares
+Block = tuple[Array, Array, Array]  # see `_blocks`
 
 
 class EdgeConv(nn.Module):
@@ -73,7 +78,7 @@ def edge_moments(
     weight = edge_weights(valid, index.shape[1], near.dtype)
     shift = _mean_over_first_slot(near[index[:, 0]] + own, weight, index)
 
-    def block(moments, rows):
+    def block(moments: Moments, rows: Block) -> tuple[Moments, None]:
         slots, own, weight = rows
         edge = near[slots] + own[None, :, :]
         return _add_moments(moments, edge, shift, weight), None
@@ -102,12 +107,12 @@ def edge_extremes(
     weight = edge_weights(valid, k, near.dtype)
     sign = jnp.where(rising, 1.0, -1.0).astype(near.dtype)
 
-    def convolve(edge):
+    def convolve(edge: Array) -> Array:
         return nn.leaky_relu(edge, LEAKY_SLOPE) @ kernel
 
     shift = _mean_over_first_slot(convolve(near[index[:, 0]] + own), weight, index)
 
-    def block(moments, rows):
+    def block(moments: Moments, rows: Block) -> tuple[Moments, Array]:
         slots, own, weight = rows
         edge = convolve(near[slots] + own[None, :, :])
         extreme = max_over_slots(edge * sign[None, None, :]) * sign[None, :]
@@ -122,22 +127,31 @@ def edge_extremes(
 
 def edge_weights(valid: Bool[Array, " n"], k: int, dtype: jnp.dtype) -> Float[Array, " n"]:
     """What each of a row's k edges counts for in a mean over all edges of the valid rows."""
-    return valid.astype(dtype) / (k * jnp.maximum(jnp.sum(valid), 1)).astype(dtype)
+    return valid.astype(dtype) / (k * divisor(jnp.sum(valid), dtype))
 
 
-def _mean_over_first_slot(edge, weight, index):
+def _mean_over_first_slot(
+    edge: Float[Array, "n c"], weight: Float[Array, " n"], index: Int[Array, "n k"]
+) -> Float[Array, " c"]:
     """A point near the mean: squares summed about it lose nothing; about zero they would cancel."""
     return jax.lax.stop_gradient(index.shape[1] * (weight @ edge))
 
 
-def _add_moments(moments, edge, shift, weight):
+def _add_moments(
+    moments: Moments,
+    edge: Float[Array, "k rows c"],
+    shift: Float[Array, " c"],
+    weight: Float[Array, " rows"],
+) -> Moments:
     """Add the weighted sums of a block's edges (k, rows, c) and of their squares about shift."""
     centred = edge - shift[None, None, :]
     mean, square = moments
     return mean + weight @ jnp.sum(centred, 0), square + weight @ jnp.sum(centred * centred, 0)
 
 
-def _blocks(index, own, weight):
+def _blocks(
+    index: Int[Array, "n k"], own: Float[Array, "n c"], weight: Float[Array, " n"]
+) -> Block:
     """Neighbour slots (blocks, k, rows), own features and weights of blocks of rows.
 
     Rows that only fill the last block weigh nothing.
@@ -146,7 +160,7 @@ def _blocks(index, own, weight):
     blocks = math.ceil(n * k * own.shape[1] / BLOCK_VALUES)
     rows = math.ceil(n / blocks)
 
-    def split(x):
+    def split(x: Array) -> Array:
         x = jnp.pad(x, [(0, blocks * rows - n)] + [(0, 0)] * (x.ndim - 1))
         return x.reshape(blocks, rows, *x.shape[1:])
 

@@ -37,7 +37,14 @@ def attention(
     return out.swapaxes(0, 1).reshape(n, d)
 
 
-def _head(query, key, value, dropout_key, valid, dropout):
+def _head(
+    query: Float[Array, "n d"],
+    key: Float[Array, "m d"],
+    value: Float[Array, "m d"],
+    dropout_key: PRNGKeyArray | None,
+    valid: Bool[Array, " m"],
+    dropout: float,
+) -> Float[Array, "n d"]:
     """One head: softmax(q k^T / sqrt(width)) v, with the division left to the n x width result."""
     present = valid.astype(value.dtype)[:, None]
     logits = jnp.matmul(query * (1.0 / math.sqrt(query.shape[-1])), key.T)

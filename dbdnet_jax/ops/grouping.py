@@ -63,7 +63,7 @@ def max_over_neighbours(
 ) -> Float[Array, "n c"]:
     """Channel-wise maximum of the neighbours' features, one neighbour slot after the other."""
 
-    def slot(best, rows):
+    def slot(best: Array, rows: Array) -> tuple[Array, None]:
         return jnp.maximum(best, features[rows]), None
 
     return jax.lax.scan(jax.checkpoint(slot), features[index[:, 0]], index[:, 1:].T)[0]
@@ -78,7 +78,9 @@ def max_over_slots(values: Float[Array, "k n c"]) -> Float[Array, "n c"]:
     return _max_and_slot(values)[0]
 
 
-def _max_and_slot(values):
+def _max_and_slot(
+    values: Float[Array, "k n c"],
+) -> tuple[Float[Array, "n c"], Int[Array, "n c"]]:
     best, slot = values[0], jnp.zeros(values.shape[1:], jnp.int32)
     for k in range(1, values.shape[0]):
         better = values[k] > best
@@ -86,12 +88,14 @@ def _max_and_slot(values):
     return best, slot
 
 
-def _max_fwd(values):
+def _max_fwd(values: Float[Array, "k n c"]) -> tuple[Array, tuple[Array, Array]]:
     best, slot = _max_and_slot(values)
-    return best, (slot, jnp.arange(values.shape[0]))
+    return best, (slot, jnp.arange(values.shape[0], dtype=slot.dtype))
 
 
-def _max_bwd(residual, cotangent):
+def _max_bwd(
+    residual: tuple[Array, Array], cotangent: Float[Array, "n c"]
+) -> tuple[Float[Array, "k n c"]]:
     slot, slots = residual
     chosen = slots[:, None, None] == slot[None, :, :]
     return (jnp.where(chosen, cotangent[None, :, :], 0.0),)
@@ -113,7 +117,9 @@ def masked_max(features: Float[Array, "n c"], valid: Bool[Array, " n"]) -> Float
     return jnp.where(jnp.any(valid), best, 0.0)
 
 
-def _masked_fwd(features, valid):
+def _masked_fwd(
+    features: Float[Array, "n c"], valid: Bool[Array, " n"]
+) -> tuple[Array, tuple[Array, Array]]:
     lowest = jnp.finfo(features.dtype).min
     # Only where a derivative is asked for: a CPU takes 4 to 12 times as long as for `jnp.max`.
     row = jnp.argmax(jnp.where(valid[:, None], features, lowest), axis=0)
@@ -121,7 +127,9 @@ def _masked_fwd(features, valid):
     return jnp.where(jnp.any(valid), best, 0.0), (row, valid)
 
 
-def _masked_bwd(residual, cotangent):
+def _masked_bwd(
+    residual: tuple[Array, Array], cotangent: Float[Array, " c"]
+) -> tuple[Float[Array, "n c"], None]:
     row, valid = residual
     rows = jnp.arange(valid.shape[0])
     chosen = (rows[:, None] == row[None, :]) & jnp.any(valid)

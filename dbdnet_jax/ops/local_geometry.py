@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 
 from dbdnet_jax.ops.grouping import squared_distances
 from dbdnet_jax.ops.rigid import HIGHEST
-from dbdnet_jax.ops.sampling import prefix_mask
+from dbdnet_jax.ops.sampling import divisor, prefix_mask
 
 RADII = (0.06, 0.12, 0.24, 0.48, 0.96)  # each twice the one before: one bell is a power of another
 DEVIATION = 0.6  # of the Gaussian weights, in radii
@@ -64,7 +64,7 @@ def local_invariants(
     """
     points = jax.lax.stop_gradient(points)
     valid = prefix_mask(points.shape[0], count)[:, None]
-    total = jnp.maximum(count, 1).astype(points.dtype)
+    total = divisor(count, points.dtype)
     # Centred, since the covariance is a difference of squares of what is summed.
     centre = jnp.sum(jnp.where(valid, points, 0.0), axis=0) / total
     points = jnp.where(valid, points - centre[None, :], 0.0)
@@ -97,7 +97,7 @@ def _invariants(
     products = jnp.stack([x * x, x * y, x * z, y * y, y * z, z * z])
     xx, xy, xz, yy, yz, zz = (moments[4:] / mass[None, :] - products) / (r * r)
 
-    def times(v):
+    def times(v: Array) -> Array:
         a, b, c = v
         rows = [xx * a + xy * b + xz * c, xy * a + yy * b + yz * c, xz * a + yz * b + zz * c]
         return jnp.stack(rows)
@@ -107,7 +107,7 @@ def _invariants(
     determinant = xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
     turn = jnp.sum(o * jnp.cross(mo, times(mo), axis=0), axis=0)
 
-    def root(square):
+    def root(square: Array) -> Array:
         return jnp.sqrt(jnp.maximum(square, 0.0))  # rounding makes a zero negative
 
     numbers = [

@@ -39,7 +39,9 @@ def quaternion_from_rotation(rotation: Float[Array, "*stack 3 3"]) -> Float[Arra
     return jnp.where(q[..., :1] < 0, -q, q)
 
 
-def multiply(c_from_b: Float[Array, "*stack 4"], b_from_a: Float[Array, "*stack 4"]):
+def multiply(
+    c_from_b: Float[Array, "*stack 4"], b_from_a: Float[Array, "*stack 4"]
+) -> Float[Array, "*stack 4"]:
     """The quaternion c_from_a of the rotation ``b_from_a`` followed by ``c_from_b``."""
     w1, x1, y1, z1 = (c_from_b[..., i] for i in range(4))
     w2, x2, y2, z2 = (b_from_a[..., i] for i in range(4))

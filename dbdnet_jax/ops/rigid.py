@@ -83,7 +83,9 @@ def rotation_from_covariance(covariance: Float[Array, "3 3"]) -> Float[Array, "3
     return _kabsch(covariance)[0]
 
 
-def _kabsch(covariance: Float[Array, "3 3"]):
+def _kabsch(
+    covariance: Float[Array, "3 3"],
+) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"], Float[Array, "3"]]:
     """The rotation, V, and the signed singular values (s1, s2, d s3), largest first."""
     u, singular, vt = jnp.linalg.svd(covariance)
     sign = jnp.sign(jnp.linalg.det(u) * jnp.linalg.det(vt))
@@ -93,12 +95,14 @@ def _kabsch(covariance: Float[Array, "3 3"]):
     return rotation, v, singular * signs
 
 
-def _rotation_fwd(covariance):
+def _rotation_fwd(covariance: Float[Array, "3 3"]) -> tuple[Array, tuple[Array, Array, Array]]:
     rotation, v, signed = _kabsch(covariance)
     return rotation, (rotation, v, signed)
 
 
-def _rotation_bwd(residual, cotangent):
+def _rotation_bwd(
+    residual: tuple[Array, Array, Array], cotangent: Float[Array, "3 3"]
+) -> tuple[Float[Array, "3 3"]]:
     """-2 R^T V [(V^T A V)_ij / (b_i + b_j)] V^T with A = (G R^T - R G^T) / 2.
 
     ``b_i + b_j`` vanishes where the rotation about an axis is undetermined (collinear input, or

@@ -28,7 +28,7 @@ def sinkhorn(
     slack_column = jnp.zeros(affinity.shape[0], affinity.dtype)
     slack_row = jnp.zeros(affinity.shape[1], affinity.dtype)
 
-    def step(carry, _):
+    def step(carry: tuple[Array, ...], _: None) -> tuple[tuple[Array, ...], None]:
         inner, slack_column, slack_row = carry
         total = _logsumexp(inner, slack_column, axis=1)
         inner, slack_column = inner - total[:, None], slack_column - total
@@ -41,7 +41,9 @@ def sinkhorn(
     return jnp.where(both, inner, LOG_ZERO)
 
 
-def _logsumexp(inner, slack, axis):
+def _logsumexp(
+    inner: Float[Array, "n m"], slack: Float[Array, " rest"], axis: int
+) -> Float[Array, " rest"]:
     """log(sum exp) over one axis of the matrix and the slack entry that belongs to it."""
     largest = jnp.maximum(jnp.max(inner, axis=axis), slack)
     largest = jax.lax.stop_gradient(largest)

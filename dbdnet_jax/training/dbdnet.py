@@ -21,6 +21,7 @@ from dbdnet_jax.metrics.pose import (
     pair_confusion,
 )
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
+from dbdnet_jax.networks.dbdnet.matching import SoftMatches
 from dbdnet_jax.networks.dbdnet.register import (
     predict_overlap_and_matches,
     register_clouds,
@@ -44,7 +45,7 @@ class OverlapConfig:
     learning_rate: float = 1e-4
     gamma: float = 4.0  # of the focal loss
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse a stage of nothing."""
         check_stage("overlap", self)
 
@@ -64,7 +65,7 @@ class RegistrationConfig:
     masks: str = "predicted"
     weights: LossWeights = LossWeights()
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse a stage of nothing, and masks that there are not."""
         check_stage("registration", self)
         if self.masks not in MASKS:
@@ -84,7 +85,7 @@ class JointConfig:
     batch_size: int = 8
     learning_rate: float = 1e-4
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse a stage of nothing."""
         check_stage("joint", self)
 
@@ -166,9 +167,15 @@ def validate_registration(
     }
 
 
-def _register_given(model, trainable, pair, masks, dropout_key=None) -> Registration:
+def _register_given(
+    model: ModelConfig,
+    trainable: Any,
+    pair: Pair,
+    masks: tuple[Array, Array],
+    dropout_key: PRNGKeyArray | None = None,
+) -> Registration:
     params = Params({"registration": trainable}, model)
-    source, target = (mask * 1.0 for mask in masks)
+    source, target = (mask.astype(pair.source.points.dtype) for mask in masks)
     return register_given_overlap(params, pair.source, pair.target, source, target, dropout_key)
 
 
@@ -178,7 +185,7 @@ def joint_turn(
     pair: Pair,
     start: Rigid | None,
     dropout_key: PRNGKeyArray | None = None,
-):
+) -> tuple[tuple[Array, Array], SoftMatches | None, Registration, Pair]:
     """One pass, and the registration of what it found: from the start, if there is one.
 
     Returns both clouds' overlap, the matches, the registration, and the pair it is of.

@@ -27,7 +27,7 @@ class DCPStage:
     batch_size: int = 32
     learning_rate: float = 1e-3
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse a stage of nothing."""
         check_stage("dcp", self)
 

@@ -38,7 +38,7 @@ class FINetStage:
     sensitivity: float = 5e-4
     margin: float = 0.01
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse a stage of nothing."""
         check_stage("finet", self)
 

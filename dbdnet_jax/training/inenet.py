@@ -14,6 +14,7 @@ from dbdnet_jax.metrics.pose import overlap_error, overlap_f1, pair_confusion
 from dbdnet_jax.networks.batch_norm import split_batch_stats
 from dbdnet_jax.networks.inenet.network import INENet, INENetConfig, as_channels, predict
 from dbdnet_jax.networks.params import Params
+from dbdnet_jax.ops.sampling import divisor
 from dbdnet_jax.training.start import initial_params
 from dbdnet_jax.training.task import RunConfig, Task, check_stage
 from dbdnet_jax.types import Cloud, Pair
@@ -29,7 +30,7 @@ class INENetStage:
     batch_size: int = 32
     learning_rate: float = 1e-3
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse a stage of nothing."""
         check_stage("inenet", self)
 
@@ -51,7 +52,7 @@ def margin_loss(
     """
     miss = jnp.abs(margin - jnp.where(labels, 1.0, -1.0))
     loss = jnp.where(miss < HUBER, 0.5 * miss * miss, HUBER * (miss - 0.5 * HUBER))
-    return jnp.sum(jnp.where(valid, loss, 0.0)) / jnp.maximum(jnp.sum(valid), 1)
+    return jnp.sum(jnp.where(valid, loss, 0.0)) / divisor(jnp.sum(valid), loss.dtype)
 
 
 def loss_of_batch(

@@ -182,7 +182,7 @@ class _Loop:
         self.checkpoints.save(done, state, row["error"])
 
     def _mean_validation(self, state: TrainState, frozen: Any, pairs: Pair) -> dict[str, Array]:
-        def one(i, weights, frozen, pairs):
+        def one(i: Array, weights: Any, frozen: Any, pairs: Pair) -> dict[str, Array]:
             pair = jax.tree.map(lambda leaf: leaf[i], pairs)
             return self.task.validate(weights, frozen, pair)
 

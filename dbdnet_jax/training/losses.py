@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 from dbdnet_jax.networks.dbdnet.matching import SoftMatches
 from dbdnet_jax.ops.grouping import squared_distances
 from dbdnet_jax.ops.rigid import HIGHEST, apply
+from dbdnet_jax.ops.sampling import divisor
 from dbdnet_jax.types import Branch, Cloud, Pair, Registration, Rigid
 
 SMALLEST_PROBABILITY = 1e-12  # keeps log finite once a float32 sigmoid has saturated
@@ -77,7 +78,7 @@ def focal_loss(
     p_true = jnp.where(label, probability, 1 - probability)
     p_true = jnp.where(valid, p_true, 1.0)  # before the log: padding may hold anything
     loss = (1 - p_true) ** gamma * -jnp.log(jnp.maximum(p_true, SMALLEST_PROBABILITY))
-    return jnp.sum(loss) / jnp.maximum(jnp.sum(valid), 1)
+    return jnp.sum(loss) / divisor(jnp.sum(valid), loss.dtype)
 
 
 def rotation_loss(
@@ -100,7 +101,7 @@ def mean_l1(
 ) -> Float[Array, ""]:
     """Mean absolute difference over the coordinates of ``rows``; 0 when there are none."""
     difference = jnp.where(rows[:, None], predicted - truth, 0.0)
-    return jnp.sum(jnp.abs(difference)) / jnp.maximum(3 * jnp.sum(rows), 1)
+    return jnp.sum(jnp.abs(difference)) / divisor(3 * jnp.sum(rows), difference.dtype)
 
 
 def correspondence_loss(
@@ -144,7 +145,7 @@ def matching_loss(
         matched = -jnp.sum(label * log_matrix, axis=axis) / jnp.where(total > 0, total, 1.0)
         slack = jnp.maximum(1 - jnp.sum(mass, axis=axis), SMALLEST_SLACK)
         loss = jnp.where(rows, jnp.where(total > 0, matched, -jnp.log(slack)), 0.0)
-        means.append(jnp.sum(loss) / jnp.maximum(jnp.sum(rows), 1))
+        means.append(jnp.sum(loss) / divisor(jnp.sum(rows), loss.dtype))
     return (means[0] + means[1]) / 2
 
 

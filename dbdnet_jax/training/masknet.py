@@ -16,6 +16,7 @@ from dbdnet_jax.networks.batch_norm import split_batch_stats
 from dbdnet_jax.networks.masknet.network import MaskNet, MaskNetConfig, predict
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.stacking import without_padding
+from dbdnet_jax.ops.sampling import divisor
 from dbdnet_jax.training.start import initial_params
 from dbdnet_jax.training.task import RunConfig, Task, check_stage
 from dbdnet_jax.types import Pair
@@ -29,7 +30,7 @@ class MaskNetStage:
     batch_size: int = 32
     learning_rate: float = 1e-4
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse a stage of nothing."""
         check_stage("masknet", self)
 
@@ -46,8 +47,8 @@ def mask_loss(
     valid: Bool[Array, "*pairs n"],
 ) -> Float[Array, ""]:
     """Mean over the points of the squared difference between mask and label."""
-    difference = jnp.where(valid, jax.nn.sigmoid(logits) - labels, 0.0)
-    return jnp.sum(difference**2) / jnp.maximum(jnp.sum(valid), 1)
+    difference = jnp.where(valid, jax.nn.sigmoid(logits) - labels.astype(logits.dtype), 0.0)
+    return jnp.sum(difference**2) / divisor(jnp.sum(valid), difference.dtype)
 
 
 def loss_of_batch(

@@ -41,7 +41,7 @@ class OMNetStage:
     learning_rate: float = 1e-4
     overlap_radius: float = 0.1
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse a stage of nothing."""
         check_stage("omnet", self)
         if self.overlap_radius <= 0:

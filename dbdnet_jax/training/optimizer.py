@@ -1,6 +1,7 @@
 """The optimizer of every stage: Adam or AdamW, its learning rate, its clipping."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import optax
@@ -29,7 +30,7 @@ def make_schedule(
             return optax.cosine_decay_schedule(peak, max(steps, 1))
         return optax.warmup_cosine_decay_schedule(first, peak, warmup_steps, steps)
 
-    def rate(step):
+    def rate(step: Any) -> Any:
         passed = sum(jnp.asarray(step >= milestone, jnp.float32) for milestone in milestones)
         warm = jnp.minimum(1.0, (step + 1) / (warmup_steps + 1)) if warmup_steps > 0 else 1.0
         left = jnp.clip((steps - step) / decay_steps, 0.0, 1.0) if decay_steps else 1.0

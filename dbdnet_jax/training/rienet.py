@@ -34,7 +34,7 @@ class RIENetStage:
     keypoints: int = 256
     huber: float = 0.01
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse a stage of nothing."""
         check_stage("rienet", self)
         if self.keypoints < 1 or self.huber <= 0:
@@ -85,7 +85,7 @@ def turn_losses(
     count = min(stage.keypoints, confidence.shape[-1])
     key_rows = jax.lax.top_k(confidence, count)[1]
 
-    def at_keys(x):
+    def at_keys(x: Array) -> Array:
         return over_pairs(lambda x, key: x[key], x)(x, key_rows)
 
     neighbourhood = jnp.sum((at_keys(moved) - at_keys(turn.correspondence)) ** 2)

@@ -101,10 +101,18 @@ def train_step(
     return state, StepMetrics(total, terms, norm, finite)
 
 
-def _by_pair(state, frozen, key, arrays, draw, loss, batch_size):
+def _by_pair(
+    state: TrainState,
+    frozen: Any,
+    key: PRNGKeyArray,
+    arrays: Any,
+    draw: Draw,
+    loss: Callable[..., Any],
+    batch_size: int,
+) -> tuple[Array, Any, Any, Any]:
     """Loss, terms and gradient as means over the pairs, each on its own."""
 
-    def one(i, params, frozen, step, key, arrays):
+    def one(i: Array, params: Any, frozen: Any, step: Array, key: PRNGKeyArray, arrays: Any) -> Any:
         draw_key, loss_key = jax.random.split(jax.random.fold_in(key, i))
         pair = draw(draw_key, step * batch_size + i, arrays)
         return jax.value_and_grad(loss, has_aux=True)(params, frozen, pair, loss_key)
@@ -115,10 +123,18 @@ def _by_pair(state, frozen, key, arrays, draw, loss, batch_size):
     return total, terms, gradient, None
 
 
-def _by_batch(state, frozen, key, arrays, draw, loss, batch_size):
+def _by_batch(
+    state: TrainState,
+    frozen: Any,
+    key: PRNGKeyArray,
+    arrays: Any,
+    draw: Draw,
+    loss: Callable[..., Any],
+    batch_size: int,
+) -> tuple[Array, Any, Any, Any]:
     """Loss, terms and gradient of all pairs together, and the new running averages."""
 
-    def one(i):
+    def one(i: Array) -> Pair:
         draw_key, _ = jax.random.split(jax.random.fold_in(key, i))
         return draw(draw_key, state.step * batch_size + i, arrays)
 

@@ -77,7 +77,7 @@ class TrainConfig:
     validation_pairs: int = 200
     devices: int = 0  # XLA devices on a CPU; 0: one for each core
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse unknown choices, and cadences that do not fit: a resumed log must be unbroken."""
         for name, choices in (("optimizer", OPTIMIZERS), ("schedule", SCHEDULES)):
             if getattr(self, name) not in choices:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from dbdnet_jax.alignment.align import Alignment
-from dbdnet_jax.alignment.downsampling import DENSE, UNIT_SIZE, downsample, farthest_rows
+from dbdnet_jax.alignment.downsampling import DENSE, UNIT_SIZE, downsample
 from dbdnet_jax.alignment.finding import LIKELY
 from dbdnet_jax.alignment.normalised import is_full_resolution, normalise_pair
 from dbdnet_jax.alignment.success import (
@@ -23,7 +23,6 @@ from dbdnet_jax.alignment.success import (
 )
 from tests.aligning import motion, pair, rotation_error_deg, solid, tiny_align
 from tests.alignment.test_quality import cylinder
-from tests.conftest import random_cloud
 
 SOURCE, TARGET, TRUE = pair()
 SAME_DEG = 0.05  # of two runs on the same clouds, otherwise written: float32 inside
@@ -164,14 +163,6 @@ def test_thinning_keeps_shape_and_forgets_density_and_strays():
     order = np.random.default_rng(0).permutation(len(points))
     again = downsample(points[order], 300)
     np.testing.assert_array_equal(points[order][again.sparse], points[chosen.sparse])
-
-
-def test_farthest_rows_are_greedy_and_skip_copies():
-    points = random_cloud(3, 30)
-    rows = farthest_rows(np.repeat(points, 3, axis=0), 90) // 3
-    assert sorted(rows) == list(range(30))
-    apart = [cKDTree(points[rows[:i]]).query(points[rows[i]])[0] for i in range(1, 30)]
-    assert np.all(np.diff(apart) <= 1e-12)
 
 
 def test_auto_scale_brings_the_larger_cloud_to_the_weights_size():

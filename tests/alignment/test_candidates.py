@@ -9,7 +9,8 @@ from dbdnet_jax.alignment.candidates import Candidate, choose, far_starts, merge
 from dbdnet_jax.alignment.point_to_plane import refine_point_to_plane
 from dbdnet_jax.alignment.success import load_coefficients
 from dbdnet_jax.alignment.surfaces import PoseFit, inlier_distance, measure_fit, surface
-from dbdnet_jax.alignment.transforms import Transform, angle_between, cube_rotations, turn_deg
+from dbdnet_jax.ops.transforms import angle_between, cube_rotations, transform_of, turn_deg
+from dbdnet_jax.types import Transform
 from tests.aligning import motion, solid
 
 NO_FIT = PoseFit(0.0, 0.0, 0.0, 0.0, 0.5, 1.0)
@@ -17,9 +18,8 @@ MIDDLE = np.zeros(3)
 
 
 def turned(degrees: float) -> Transform:
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_rotvec([0, 0, degrees], degrees=True).as_matrix()
-    return pose
+    turn = Rotation.from_rotvec([0, 0, degrees], degrees=True)
+    return transform_of(turn.as_matrix(), np.zeros(3))
 
 
 @pytest.fixture(scope="module")
@@ -85,8 +85,7 @@ def test_a_small_overlap_that_lies_well_beats_a_large_one_that_does_not():
     other = solid(4000, 1)
     right = other[other[:, 0] > np.quantile(other[:, 0], 0.4)]
     sides = surface(left), surface(right)
-    over = np.eye(4)
-    over[:3, 3] = right.mean(axis=0) - left.mean(axis=0)
+    over = transform_of(np.eye(3), right.mean(axis=0) - left.mean(axis=0))
     best = rank([over, np.eye(4)], *sides, load_coefficients())[0]
     np.testing.assert_array_equal(best.pose, np.eye(4))
 

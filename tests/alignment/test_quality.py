@@ -5,7 +5,6 @@ import pytest
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from dbdnet_jax.alignment.downsampling import farthest_rows
 from dbdnet_jax.alignment.quality import (
     CHANCE_RATIO,
     Motion,
@@ -15,6 +14,7 @@ from dbdnet_jax.alignment.quality import (
     shared_point_score,
 )
 from dbdnet_jax.alignment.surfaces import inlier_distance, surface
+from dbdnet_jax.ops.sampling import farthest_rows
 from tests.aligning import solid
 from tests.conftest import random_cloud
 

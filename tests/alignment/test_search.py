@@ -5,8 +5,8 @@ import pytest
 
 from dbdnet_jax.alignment import search
 from dbdnet_jax.alignment.surfaces import surface
-from dbdnet_jax.alignment.transforms import angle_between, move
 from dbdnet_jax.classical import refine as em_icp
+from dbdnet_jax.ops.transforms import angle_between, move
 from tests.aligning import motion, solid
 
 

@@ -5,7 +5,6 @@ import pytest
 
 from dbdnet_jax.data import surface
 from dbdnet_jax.data.procedural import solids
-from tests import oracle
 from tests.conftest import FLOAT64, assert_close
 
 VERTICES = np.array([[0, 0, 0], [4, 0, 0], [0, 1, 0], [0, 0, 3.0]])
@@ -27,12 +26,6 @@ def test_sampling_is_by_area_and_skips_degenerate_faces() -> None:
     np.testing.assert_allclose(points[on_floor].mean(0), [4 / 3, 1 / 3, 0], atol=0.05)
     with pytest.raises(ValueError, match="all degenerate"):
         surface.sample_surface(VERTICES, TRIANGLES[1:2], 10, rng)
-
-
-@pytest.mark.parametrize("scale", [(1, 1, 1), (0, 1, 9), (5, 0, 0)])
-def test_farthest_points_equal_a_plain_loop(scale: tuple[int, int, int]) -> None:
-    points = np.random.default_rng(1).normal(size=(60, 3)) * scale
-    assert surface.farthest_points(points, 20).tolist() == oracle.farthest_samples(points, 20)
 
 
 @pytest.mark.parametrize(

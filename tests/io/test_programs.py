@@ -34,8 +34,8 @@ def answer_nothing(params, source, target) -> Registration:
     return Registration(
         rotation=jnp.eye(3),
         translation=jnp.zeros(3),
-        src_overlap=masks[0] * 1.0,
-        tgt_overlap=masks[1] * 1.0,
+        src_overlap=masks[0].astype(float),
+        tgt_overlap=masks[1].astype(float),
         src_kept=masks[0],
         tgt_kept=masks[1],
         rotation_branch=branch,

@@ -23,7 +23,7 @@ from tests.conftest import (
 
 def mixed(rotation):
     """A scalar that depends on every entry of a rotation, and on none as on another."""
-    return jnp.sum(jnp.sin(jnp.arange(1, 10).reshape(3, 3) * rotation))
+    return jnp.sum(jnp.sin(jnp.arange(1, 10, dtype=rotation.dtype).reshape(3, 3) * rotation))
 
 
 def pose_loss(source, target, weights):

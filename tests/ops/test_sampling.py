@@ -51,6 +51,20 @@ def test_fewer_or_more_farthest_points_can_be_asked_for():
         assert_same_rows(found[sampled:], np.setdiff1d(np.arange(48), found[:sampled]))
 
 
+@pytest.mark.parametrize("scale", [(1, 1, 1), (0, 1, 9), (5, 0, 0)])
+def test_farthest_rows_on_the_host_are_the_oracles(scale):
+    points = np.random.default_rng(1).normal(size=(60, 3)) * scale
+    assert_same_rows(sampling.farthest_rows(points, 20), oracle.farthest_samples(points, 20))
+    begun = sampling.farthest_rows(np.roll(points, 7, axis=0), 20, 7)
+    assert_same_rows((begun - 7) % 60, oracle.farthest_samples(points, 20))
+
+
+def test_farthest_rows_on_the_host_skip_copies():
+    points = random_cloud(3, 30)
+    rows = sampling.farthest_rows(np.repeat(points, 3, axis=0), 90) // 3
+    assert_same_rows(rows, oracle.farthest_samples(points, 30))
+
+
 def test_ties_and_duplicates_in_the_farthest_order_go_to_the_lower_row(degenerate):
     rounded = np.round(degenerate * 64) / 64  # distances are exact, so that ties are ties
     expected = oracle.farthest_order(rounded, len(rounded))

@@ -234,7 +234,7 @@ def test_mean_over_pairs_is_the_mean_on_any_hardware(monkeypatch, backend, count
     offset = jnp.asarray([0.5, -1.0])
 
     def function(i, offset):
-        return {"a": jnp.sin(i * 1.0) + offset, "b": jnp.where(i < count, 1.0, jnp.nan)}
+        return {"a": jnp.sin(i.astype(float)) + offset, "b": jnp.where(i < count, 1.0, jnp.nan)}
 
     found = jax.jit(lambda offset: mean_over_pairs(function, count, offset))(offset)
     expected = np.mean([np.sin(i) + np.asarray(offset) for i in range(count)], axis=0)

@@ -5,10 +5,11 @@ Nothing in a file is executed, and no other file is opened for it (materials, te
 
 from typing import Any
 
-from dbdnet_jax.io.point_files.check import LARGEST, MIN_POINTS, Points, check_points
+from dbdnet_jax.io.point_files.check import LARGEST, MIN_POINTS, check_points
 from dbdnet_jax.io.point_files.read import read_file, read_point_file
 from dbdnet_jax.io.point_files.record import PointFile
 from dbdnet_jax.io.point_files.surface import MESH_SAMPLES
+from dbdnet_jax.types import Points
 
 __all__ = [
     "LARGEST",

@@ -3,9 +3,8 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
-Points = Float[np.ndarray, "n 3"]
+from dbdnet_jax.types import Points
 
 MIN_POINTS = 16
 LARGEST = 1e100  # of a coordinate: squares and their sums must stay finite

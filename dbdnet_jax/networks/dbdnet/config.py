@@ -61,7 +61,7 @@ class ModelConfig:
     sinkhorn_iterations: int = 5
     released: bool = False
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse what cannot be built: types and bounds first, then what must fit together.
 
         Raises:
@@ -77,7 +77,7 @@ class ModelConfig:
         self._check_widths()
         self._check_combinations()
 
-    def _check_widths(self):
+    def _check_widths(self) -> None:
         for name in ("overlap_channels", "registration_channels"):
             channels = getattr(self, name)
             if channels % 4:
@@ -97,7 +97,7 @@ class ModelConfig:
                     f"group norms have up to 16 groups); got {getattr(self, name)}. Use 128."
                 )
 
-    def _check_combinations(self):
+    def _check_combinations(self) -> None:
         if self.overlap_passes > 1 and not self.overlap_matching:
             raise ValueError(
                 "overlap_passes must be 1 without overlap_matching, whose matches give the motion "

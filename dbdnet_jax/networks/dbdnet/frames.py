@@ -2,13 +2,13 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.ops import rigid
 from dbdnet_jax.ops.local_geometry import local_geometry
 from dbdnet_jax.ops.rigid import HIGHEST
-from dbdnet_jax.ops.sampling import farthest_order, inverse_order, prefix_order
+from dbdnet_jax.ops.sampling import divisor, farthest_order, inverse_order, prefix_order
 from dbdnet_jax.types import Cloud, Rigid
 
 FEWEST_ROWS = 8  # of a stack: the coarsest of four levels has one row
@@ -27,7 +27,12 @@ def stack_clouds(source: Cloud, target: Cloud) -> Cloud:
     return Cloud(points, jnp.stack([jnp.asarray(source.count), jnp.asarray(target.count)]))
 
 
-def stack_masked(src, tgt, src_mask, tgt_mask) -> tuple[Cloud, Int[Array, "2 n"]]:
+def stack_masked(
+    src: Float[Array, "n 3"],
+    tgt: Float[Array, "m 3"],
+    src_mask: Bool[Array, " n"] | None,
+    tgt_mask: Bool[Array, " m"] | None,
+) -> tuple[Cloud, Int[Array, "2 rows"]]:
     """Stack two clouds with masks; ``order[c, row]`` is the caller's row of a stacked row."""
     size = max(src.shape[0], tgt.shape[0], FEWEST_ROWS)
     masks = [
@@ -62,7 +67,9 @@ def reordered(
     return jnp.take_along_axis(geometry, order[..., None], axis=1)
 
 
-def centre_and_order(clouds: Cloud, config: ModelConfig, limit: int):
+def centre_and_order(
+    clouds: Cloud, config: ModelConfig, limit: int
+) -> tuple[Cloud, Int[Array, "2 n"], Int[Array, "2 n"] | None, Float[Array, "2 3"]]:
     """Centre both clouds and bring them into farthest-point order.
 
     ``limit`` rows are sampled; half of the points where it is 0.
@@ -72,7 +79,7 @@ def centre_and_order(clouds: Cloud, config: ModelConfig, limit: int):
     """
     valid = clouds.valid[..., None]
     points = jnp.where(valid, clouds.points, 0.0)
-    centroid = jnp.sum(points, axis=1) / jnp.maximum(clouds.count, 1)[:, None]
+    centroid = jnp.sum(points, axis=1) / divisor(clouds.count, points.dtype)[:, None]
     if config.released:
         centroid = jnp.zeros_like(centroid)  # departure: the released network sees raw coordinates
     points = jnp.where(valid, points - centroid[:, None, :], 0.0)

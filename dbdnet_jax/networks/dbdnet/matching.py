@@ -96,7 +96,7 @@ def match_features(matched: SoftMatches) -> Float[Array, "2 n f"]:
     distance = squared_distances(points[0], points[1])
     distance = jnp.where(valid[0][:, None] & valid[1][None, :], distance, FAR)
 
-    def fit(matrix, distance, own, other):
+    def fit(matrix: Array, distance: Array, own: Array, other: Array) -> Array:
         soft, mass = soft_targets(matrix, other)
         squares = [jnp.min(distance, axis=1), jnp.sum((own - soft) ** 2, axis=1)]
         bells = [jnp.exp(-square / width**2) for square in squares for width in WIDTHS]

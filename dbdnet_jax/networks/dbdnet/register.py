@@ -4,9 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.dbdnet.frames import (
-    centre_and_order,
     centred,
     geometry_of,
     move_source,
@@ -14,19 +12,17 @@ from dbdnet_jax.networks.dbdnet.frames import (
     reordered,
     stack_clouds,
     stack_masked,
-    truncate_rows,
     uncentred,
 )
-from dbdnet_jax.networks.dbdnet.matching import SoftMatches, soft_targets
+from dbdnet_jax.networks.dbdnet.iterations import iterate
+from dbdnet_jax.networks.dbdnet.matching import SoftMatches
 from dbdnet_jax.networks.dbdnet.overlap_pass import (
     apply_overlap_network,
     prepare_pair,
     probability_of_all,
 )
-from dbdnet_jax.networks.dbdnet.registration import RegistrationNetwork
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.ops import rigid
-from dbdnet_jax.ops.rigid import HIGHEST
 from dbdnet_jax.ops.sampling import inverse_order, prefix_mask, prefix_order
 from dbdnet_jax.types import Branch, Cloud, Registration, Rigid
 
@@ -57,14 +53,14 @@ def register(
     prepared = prepare_pair(params.config, clouds)
     start = rigid.identity(clouds.points.dtype)
     if params.config.overlap_passes == 1:
-        logits, _ = apply_overlap_network(params, prepared, start)
+        logits = apply_overlap_network(params, prepared, start)[0]
         probability = probability_of_all(prepared, logits)
         return _register(params, clouds, order, probability, sizes, prepared.geometry)
 
     level = clouds._replace(points=clouds.points - prepared.centroid[:, None, :])
 
-    def pass_and_register(motion, _):
-        logits, _ = apply_overlap_network(params, prepared, motion)
+    def pass_and_register(motion: Rigid, _: None) -> tuple[Rigid, tuple[Rigid, Registration]]:
+        logits = apply_overlap_network(params, prepared, motion)[0]
         moved = move_source(level, motion)
         probability = probability_of_all(prepared, logits)
         answer = _register(params, moved, order, probability, sizes, prepared.geometry)
@@ -135,7 +131,7 @@ def predict_overlap_and_matches(
     """
     prepared = prepare_pair(params.config, stack_clouds(source, target))
 
-    def one_pass(motion, _):
+    def one_pass(motion: Rigid, _: None) -> tuple[Rigid, tuple[Array, SoftMatches | None]]:
         logits, matched = apply_overlap_network(params, prepared, motion, dropout_key)
         after = motion if matched is None else centred(matched.motion, prepared.centroid)
         return after, (logits, matched)
@@ -188,7 +184,13 @@ def select(
 
 
 def _register(
-    params, clouds, order, probability, sizes, geometry, dropout_key=None
+    params: Params,
+    clouds: Cloud,
+    order: Int[Array, "2 rows"],
+    probability: Float[Array, "2 rows"],
+    sizes: tuple[int, int],
+    geometry: Float[Array, "2 rows g"] | None,
+    dropout_key: PRNGKeyArray | None = None,
 ) -> Registration:
     """Select, match, solve, and bring everything back to the caller's rows."""
     config = params.config
@@ -196,7 +198,7 @@ def _register(
         lambda p, c: select(p, c, config.overlap_threshold, config.min_points)
     )(jax.lax.stop_gradient(probability), clouds.count)
     kept = Cloud(jnp.take_along_axis(clouds.points, chosen[..., None], axis=1), count)
-    motion, correspondence, targets, sampled, solvable = _iterate(
+    motion, correspondence, targets, sampled, solvable = iterate(
         params, kept, reordered(geometry, chosen), dropout_key
     )
     seen = targets.shape[1]
@@ -232,67 +234,3 @@ def _register(
 def _identity_unless(valid: Bool[Array, ""], motion: Rigid) -> Rigid:
     identity = rigid.identity(motion.rotation.dtype)
     return jax.tree.map(lambda found, rest: jnp.where(valid, found, rest), motion, identity)
-
-
-def _iterate(params: Params, kept: Cloud, geometry: Array | None, dropout_key):
-    """Run the registration network ``config.iterations`` times on the selected clouds.
-
-    Returns the motion, the last correspondences and soft targets of both branches (rows in the
-    network's order), that order, and whether the last solve was determined.
-    """
-    config = params.config
-    network = RegistrationNetwork(config)
-    variables = {"params": params.registration}
-    unmoved = None
-    if config.released:
-        # Departure: features of the unmoved source serve all iterations.
-        ordered, _, skip_rows, _ = centre_and_order(kept, config, 0)
-        unmoved = network.apply(variables, ordered, skip_rows, method="encode")
-
-    def iterate(motion, key):
-        moved = move_source(kept, motion)
-        ordered, order, skip_rows, centroid = centre_and_order(
-            moved, config, config.registration_points
-        )
-        ordered, features = truncate_rows(ordered, config.registration_points), unmoved
-        if features is None:
-            around = reordered(geometry, order[:, : ordered.points.shape[1]])
-            features = network.apply(variables, ordered, skip_rows, around, method="encode")
-        matrix = jnp.asarray(network.apply(variables, ordered, features, key, method="match"))
-        increment, targets, solvable = _solve(matrix, ordered, centroid, config)
-        motion = rigid.compose(increment, motion)
-        return motion, (increment, matrix, targets, order, solvable)
-
-    keys = None if dropout_key is None else jax.random.split(dropout_key, config.iterations)
-    start = rigid.identity(kept.points.dtype)
-    motion, steps = jax.lax.scan(iterate, start, keys, length=config.iterations)
-    increment, matrix, targets, order, solvable = jax.tree.map(lambda leaf: leaf[-1], steps)
-    # Departure: the released code returns the last increment instead of the composed motion.
-    return increment if config.released else motion, matrix, targets, order, solvable
-
-
-def _solve(
-    matrix: Float[Array, "2 n n"],
-    ordered: Cloud,
-    centroid: Float[Array, "2 3"],
-    config: ModelConfig,
-) -> tuple[Rigid, Float[Array, "2 n 3"], Bool[Array, ""]]:
-    """R from the first branch's soft correspondences, t from the second's.
-
-    The soft targets are returned in the target's own frame, centring undone.
-    """
-    source, target = ordered.points
-    if config.released:
-        # Departure: not divided by the row's mass, so slack pulls points to the origin, and every
-        # kept row weighs the same.
-        soft = jnp.matmul(matrix, target, precision=HIGHEST)
-        valid = ordered.valid[0].astype(source.dtype)
-        weights = jnp.broadcast_to(valid, matrix.shape[:2])
-    else:
-        soft, weights = jax.vmap(soft_targets, in_axes=(0, None))(matrix, target)
-    of_rotation, singular = rigid.procrustes(source, soft[0], weights[0])
-    of_translation, _ = rigid.procrustes(source, soft[1], weights[1])
-    motion = uncentred(Rigid(of_rotation.rotation, of_translation.translation), centroid)
-    finite = jnp.all(jnp.isfinite(motion.rotation)) & jnp.all(jnp.isfinite(motion.translation))
-    determined = (singular[1] > 1e-6) & jnp.all(jnp.sum(weights, axis=1) > 1e-6)
-    return motion, soft + centroid[None, 1:], finite & determined

@@ -1,11 +1,12 @@
 """The registration network: two branches of soft correspondences, one for R and one for t."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from dbdnet_jax.networks.blocks import (
     Affine,
@@ -62,13 +63,13 @@ class RegistrationNetwork(nn.Module):
 
     config: ModelConfig
 
-    def setup(self):
+    def setup(self) -> None:
         """Declare the encoder, the parameter network and the three stacks of blocks."""
         config = self.config
         self.encoder = Encoder(config.registration_channels, config.neighbour_space)
         self.weight_net = ParameterNetwork(config)
 
-        def stack(size):
+        def stack(size: int) -> list[AttentionBlock]:
             return [AttentionBlock(config.heads, config.dropout) for _ in range(size)]
 
         self.attention = stack(config.shared_blocks)
@@ -114,9 +115,9 @@ class RegistrationNetwork(nn.Module):
         of_translation = _run(self.attention_t, shared, valid, keys[2])
         scale = self.weight_net(clouds)
 
-        def correspond(x, beta, alpha):
+        def correspond(x: Array, beta: Array, alpha: Array) -> Array:
             affinity = -beta * (squared_distances(x[0], x[1]) - alpha)
-            return jnp.exp(sinkhorn(affinity, *valid, self.config.sinkhorn_iterations))
+            return jnp.exp(sinkhorn(affinity, valid[0], valid[1], self.config.sinkhorn_iterations))
 
         return jnp.stack(
             [
@@ -126,7 +127,12 @@ class RegistrationNetwork(nn.Module):
         )
 
 
-def _run(blocks, features, valid, key):
+def _run(
+    blocks: Sequence[AttentionBlock],
+    features: Float[Array, "2 n d"],
+    valid: Bool[Array, "2 n"],
+    key: PRNGKeyArray | None,
+) -> Float[Array, "2 n d"]:
     """One block after another, each with its own dropout key."""
     keys = [None] * len(blocks) if key is None else jax.random.split(key, len(blocks))
     for block, block_key in zip(blocks, keys, strict=True):

@@ -38,7 +38,7 @@ class DCPConfig:
     hidden: int = 1024
     blocks: int = 1
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse unknown pointers and layers of nothing."""
         if self.pointer not in POINTERS:
             raise ValueError(
@@ -65,7 +65,7 @@ class DCP(nn.Module):
 
     config: DCPConfig
 
-    def setup(self):
+    def setup(self) -> None:
         """The encoder, and the transformer's two halves."""
         config = self.config
         self.encoder = EdgeFeatures(config.edges, config.features, difference=False)
@@ -74,7 +74,9 @@ class DCP(nn.Module):
             self.pointer_encoder = Layers(*sizes)
             self.pointer_decoder = Layers(*sizes)
 
-    def __call__(self, source: Cloud, target: Cloud, training: bool = False):
+    def __call__(
+        self, source: Cloud, target: Cloud, training: bool = False
+    ) -> tuple[Float[Array, "*pairs n d"], Float[Array, "*pairs m d"]]:
         """Features of one pair with folded parameters; in training, of a stack of pairs.
 
         The batch's statistics are of each cloud on its own, the source's first.

@@ -31,7 +31,7 @@ class TwoBranches(nn.Module):
         valid = jnp.concatenate([source.valid, target.valid], axis=-1)
         n, m = source.points.shape[-2], target.points.shape[-2]
 
-        def pool_clouds(x, present):
+        def pool_clouds(x: Array, present: Array) -> Array:
             both = (x[..., :n, :], present[..., :n]), (x[..., n:, :], present[..., n:])
             return jnp.stack([pool(*cloud) for cloud in both], axis=-2)
 

@@ -40,7 +40,7 @@ class FINetConfig:
     regression: tuple[int, ...] = (2048, 1024, 512, 256)
     released: bool = False
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse layers of nothing."""
         chains = self.encoder, self.fusion, self.regression
         if self.turns < 1 or any(not w or min(w) < 1 for w in chains):

@@ -18,6 +18,7 @@ from dbdnet_jax.networks.blocks import affine_shapes
 from dbdnet_jax.networks.chains import Chain, chain_shapes
 from dbdnet_jax.networks.params import Params, Shapes
 from dbdnet_jax.networks.stacking import Rows, over_pairs, pool, without_padding, zero_padding
+from dbdnet_jax.ops.sampling import divisor
 from dbdnet_jax.types import Answer, Cloud
 
 HEAD_SLOPE = 0.01  # of the leaky ReLUs behind the encoder
@@ -41,7 +42,7 @@ class INENetConfig:
     threshold: tuple[int, ...] = (512, 256, 128)
     released: bool = False
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse layers of nothing."""
         chains = self.transform, self.transform_head, self.encoder, self.mask, self.threshold
         if min(self.points, self.features) < 1 or any(not w or min(w) < 1 for w in chains):
@@ -153,7 +154,7 @@ def _unit_rows(x: Float[Array, "*rows d"]) -> Float[Array, "*rows d"]:
 
 
 def _mean(x: Float[Array, "*pairs n d"], valid: Array) -> Float[Array, "*pairs d"]:
-    total = jnp.maximum(jnp.sum(valid, axis=-1), 1).astype(x.dtype)
+    total = divisor(jnp.sum(valid, axis=-1), x.dtype)
     total_of_rows = jnp.sum(zero_padding(x, valid), axis=-2)
     return total_of_rows / jnp.broadcast_to(total[..., None], total_of_rows.shape)
 

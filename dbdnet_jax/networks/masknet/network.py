@@ -28,7 +28,7 @@ class MaskNetConfig:
     encoder: tuple[int, ...] = (64, 64, 64, 128, 1024)
     head: tuple[int, ...] = (1024, 512, 256, 128)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse layers of nothing."""
         for name in ("encoder", "head"):
             widths = getattr(self, name)
@@ -61,7 +61,7 @@ class MaskNet(nn.Module):
             for i, width in enumerate(self.config.encoder)
         ]
 
-        def encode(x):
+        def encode(x: Array) -> Array:
             for layer in encoder:
                 x = layer(x, training)
             return x

@@ -41,7 +41,7 @@ class OMNetConfig:
     decoder: tuple[int, ...] = (512, 256, 256)
     regression: tuple[int, ...] = (2048, 1024, 512, 256)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse layers of nothing."""
         chains = self.encoder, self.fusion, self.decoder, self.regression
         if self.turns < 1 or any(not widths or min(widths) < 1 for widths in chains):

@@ -34,7 +34,7 @@ class Confidence(nn.Module):
             for i, width in enumerate((self.width, 2 * self.width))
         ]
 
-        def encode(points):
+        def encode(points: Array) -> Array:
             x = points[..., None, :] - rows(points, index)
             for layer in edges:
                 x = layer(beside_neighbours(x), training)

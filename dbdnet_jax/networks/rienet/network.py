@@ -38,7 +38,7 @@ class RIENetConfig:
     features: int = 256
     width: int = 8
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         """Refuse layers of nothing."""
         sizes = (self.k1, self.turns, self.features, self.width)
         if not self.edges or min(*self.edges, *sizes) < 1 or self.k2 < 2:
@@ -119,7 +119,7 @@ def _match(
     distance = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
     seen = jnp.broadcast_to(target.valid[..., None, :], distance.shape)
 
-    def soft(x):
+    def soft(x: Array) -> Array:
         return jax.nn.softmax(jnp.where(seen, -x, jnp.finfo(x.dtype).min), axis=-1)
 
     scores = soft(distance)

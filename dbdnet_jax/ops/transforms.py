@@ -5,16 +5,32 @@ import itertools
 import numpy as np
 from jaxtyping import Float
 
-Transform = Float[np.ndarray, "4 4"]
+from dbdnet_jax.types import Transform
 
 
-def as_transform(rotation: Float[np.ndarray, "3 3"], translation) -> Transform:
-    """A 4x4 float64 matrix; the rotation is the nearest one to the given matrix."""
-    u, _, vt = np.linalg.svd(np.asarray(rotation, np.float64))
+def transform_of(
+    rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]
+) -> Transform:
+    """The 4x4 float64 matrix of a rotation, taken as it is, and a translation."""
     transform = np.eye(4)
-    transform[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    transform[:3, :3] = rotation
     transform[:3, 3] = translation
     return transform
+
+
+def nearest_rotation(matrix: Float[np.ndarray, "*k 3 3"]) -> Float[np.ndarray, "*k 3 3"]:
+    """The float64 rotation that differs least from a matrix; of several, each one's."""
+    u, _, vt = np.linalg.svd(np.asarray(matrix, np.float64))
+    signs = np.ones((*u.shape[:-2], 1, 3))
+    signs[..., 0, 2] = np.linalg.det(u @ vt)
+    return (u * signs) @ vt
+
+
+def as_transform(
+    rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]
+) -> Transform:
+    """A 4x4 float64 matrix; the rotation is the nearest one to the given matrix."""
+    return transform_of(nearest_rotation(rotation), translation)
 
 
 def move(transform: Transform, points: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
