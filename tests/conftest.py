@@ -1,11 +1,12 @@
 """What every test shares: the switches of JAX, named tolerances, and clouds that make trouble.
 
-Tests run on the CPU with two XLA devices, refuse silent rank promotion, and check the shapes in
-the package's signatures (jaxtyping and beartype; users of the package pay nothing for them).
-Compiled programs are shared by all workers and child processes of one session.
+Tests run on the CPU with two XLA devices, refuse silent promotion of ranks and of types, and check
+the shapes in the package's signatures (jaxtyping and beartype; users of the package pay nothing for
+them). Compiled programs are shared by all workers and child processes of one session.
 """
 
 import atexit
+import functools
 import os
 import shutil
 import tempfile
@@ -26,14 +27,37 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
 import jax  # noqa: E402  the environment is read on import
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
+import optax  # noqa: E402
 import pytest  # noqa: E402
 from jax.test_util import check_grads  # noqa: E402
 from jaxtyping import install_import_hook  # noqa: E402
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_num_cpu_devices", 2)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 install_import_hook("dbdnet_jax", "beartype.beartype")
+
+
+def _promoting(function):
+    """``function`` and the functions that it gives, with JAX's standard promotion of types."""
+
+    @functools.wraps(function)
+    def promoted(*arguments, **options):
+        with jax.numpy_dtype_promotion("standard"):
+            found = function(*arguments, **options)
+        if callable(found):
+            return _promoting(found)
+        if isinstance(found, optax.GradientTransformation):
+            return found._replace(update=_promoting(found.update))
+        return found
+
+    return promoted
+
+
+# optax takes powers and cosines of its int32 counts of steps.
+for _name in ("adam", "adamw", "cosine_decay_schedule", "warmup_cosine_decay_schedule"):
+    setattr(optax, _name, _promoting(getattr(optax, _name)))
 
 
 # Folders and files whose tests are marked fast: together under two minutes on two idle cores.

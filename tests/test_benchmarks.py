@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import jaxprs_in_params
 
 from benchmarks import arithmetic, machine
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
@@ -36,7 +37,7 @@ def products(jaxpr) -> int:
             left, (out,) = equation.invars[0].aval, equation.outvars
             total += math.prod(out.aval.shape) * math.prod(left.shape[i] for i in contracted)
         times = equation.params.get("length", 1) if equation.primitive.name == "scan" else 1
-        total += times * sum(map(products, jax.core.jaxprs_in_params(equation.params)))
+        total += times * sum(map(products, jaxprs_in_params(equation.params)))
     return total
 
 

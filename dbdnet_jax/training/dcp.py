@@ -11,11 +11,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dbdnet_jax.metrics.pose import rotation_error_deg, translation_error
-from dbdnet_jax.networks.batch_norm import split_batch_stats
 from dbdnet_jax.networks.dcp.network import DCP, DCPConfig, match, predict_pose
 from dbdnet_jax.networks.params import Params
-from dbdnet_jax.training.start import initial_params
 from dbdnet_jax.training.task import RunConfig, Task, check_stage
+from dbdnet_jax.training.whole import whole_network_task
 from dbdnet_jax.types import Pair, Rigid
 
 
@@ -88,11 +87,5 @@ def validate(
 
 def dcp_task(config: RunConfig, run_dir: str | Path) -> Task:
     """The whole network, from fresh weights or ``config.train.start``."""
-    trainable, batch_stats = split_batch_stats(initial_params(config).networks["dcp"])
-    return Task(
-        trainable,
-        None,
-        functools.partial(loss_of_batch, config.model),
-        functools.partial(validate, config.model),
-        batch_stats=batch_stats,
-    )
+    loss = functools.partial(loss_of_batch, config.model)
+    return whole_network_task(config, loss, validate)

@@ -12,12 +12,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dbdnet_jax.metrics.pose import rotation_error_deg, translation_error
-from dbdnet_jax.networks.batch_norm import split_batch_stats
 from dbdnet_jax.networks.chains import pose_terms, quaternion_pose
 from dbdnet_jax.networks.finet.network import SENSITIVE, FINet, FINetConfig, Turn, predict_pose
 from dbdnet_jax.networks.params import Params
-from dbdnet_jax.training.start import initial_params
 from dbdnet_jax.training.task import RunConfig, Task, check_stage
+from dbdnet_jax.training.whole import whole_network_task
 from dbdnet_jax.types import Pair, Rigid
 
 TRANSLATION_WEIGHT = 4.0
@@ -130,11 +129,5 @@ def validate(
 
 def finet_task(config: RunConfig, run_dir: str | Path) -> Task:
     """The whole network, from fresh weights or ``config.train.start``."""
-    trainable, batch_stats = split_batch_stats(initial_params(config).networks["finet"])
-    return Task(
-        trainable,
-        None,
-        functools.partial(loss_of_batch, config.model, config.stages["finet"]),
-        functools.partial(validate, config.model),
-        batch_stats=batch_stats,
-    )
+    loss = functools.partial(loss_of_batch, config.model, config.stages["finet"])
+    return whole_network_task(config, loss, validate)

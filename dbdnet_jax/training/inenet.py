@@ -10,13 +10,11 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from dbdnet_jax.metrics.pose import overlap_error, overlap_f1, pair_confusion
-from dbdnet_jax.networks.batch_norm import split_batch_stats
 from dbdnet_jax.networks.inenet.network import INENet, INENetConfig, as_channels, predict
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.ops.sampling import divisor
-from dbdnet_jax.training.start import initial_params
 from dbdnet_jax.training.task import RunConfig, Task, check_stage
+from dbdnet_jax.training.whole import overlap_scores, whole_network_task
 from dbdnet_jax.types import Cloud, Pair
 
 HUBER = 0.4  # where the loss turns from a parabola to a line
@@ -88,19 +86,11 @@ def validate(
     model: INENetConfig, weights: Any, frozen: None, pair: Pair
 ) -> dict[str, Float[Array, ""]]:
     """The share of points of the wrong class, and F1."""
-    answer = predict(Params({"inenet": weights}, model), pair.source, pair.target)
-    assert answer.source_overlap is not None and answer.target_overlap is not None  # its work
-    counts = pair_confusion(answer.source_overlap, answer.target_overlap, pair)
-    return {"error": overlap_error(counts), "f1": overlap_f1(counts)}
+    params = Params({"inenet": weights}, model)
+    return overlap_scores(predict(params, pair.source, pair.target), pair)
 
 
 def inenet_task(config: RunConfig, run_dir: str | Path) -> Task:
     """The whole network, from fresh weights or ``config.train.start``."""
-    trainable, batch_stats = split_batch_stats(initial_params(config).networks["inenet"])
-    return Task(
-        trainable,
-        None,
-        functools.partial(loss_of_batch, config.model),
-        functools.partial(validate, config.model),
-        batch_stats=batch_stats,
-    )
+    loss = functools.partial(loss_of_batch, config.model)
+    return whole_network_task(config, loss, validate)

@@ -17,14 +17,13 @@ from dbdnet_jax.metrics.pose import (
     rotation_error_deg,
     translation_error,
 )
-from dbdnet_jax.networks.batch_norm import split_batch_stats
 from dbdnet_jax.networks.chains import pose_terms, quaternion_pose
 from dbdnet_jax.networks.omnet.network import OMNet, OMNetConfig, Turn, predict
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.stacking import move, over_pairs
 from dbdnet_jax.ops.grouping import squared_distances
-from dbdnet_jax.training.start import initial_params
 from dbdnet_jax.training.task import RunConfig, Task, check_stage
+from dbdnet_jax.training.whole import whole_network_task
 from dbdnet_jax.types import Cloud, Pair, Rigid
 
 CLASS_WEIGHTS = (0.7, 0.3)  # without and with a counterpart
@@ -147,11 +146,5 @@ def validate(
 
 def omnet_task(config: RunConfig, run_dir: str | Path) -> Task:
     """The whole network, from fresh weights or ``config.train.start``."""
-    trainable, batch_stats = split_batch_stats(initial_params(config).networks["omnet"])
-    return Task(
-        trainable,
-        None,
-        functools.partial(loss_of_batch, config.model, config.stages["omnet"]),
-        functools.partial(validate, config.model),
-        batch_stats=batch_stats,
-    )
+    loss = functools.partial(loss_of_batch, config.model, config.stages["omnet"])
+    return whole_network_task(config, loss, validate)

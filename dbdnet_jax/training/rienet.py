@@ -12,13 +12,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from dbdnet_jax.metrics.pose import rotation_error_deg, translation_error
-from dbdnet_jax.networks.batch_norm import split_batch_stats
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.rienet.network import RIENet, RIENetConfig, Turn, predict_pose
 from dbdnet_jax.networks.stacking import move, over_pairs, rows
 from dbdnet_jax.ops.grouping import squared_distances
-from dbdnet_jax.training.start import initial_params
 from dbdnet_jax.training.task import RunConfig, Task, check_stage
+from dbdnet_jax.training.whole import whole_network_task
 from dbdnet_jax.types import Cloud, Pair
 
 SMALLEST_SCORE = 1e-15  # its logarithm is finite
@@ -144,11 +143,5 @@ def validate(
 
 def rienet_task(config: RunConfig, run_dir: str | Path) -> Task:
     """The whole network, from fresh weights or ``config.train.start``."""
-    trainable, batch_stats = split_batch_stats(initial_params(config).networks["rienet"])
-    return Task(
-        trainable,
-        None,
-        functools.partial(loss_of_batch, config.model, config.stages["rienet"]),
-        functools.partial(validate, config.model),
-        batch_stats=batch_stats,
-    )
+    loss = functools.partial(loss_of_batch, config.model, config.stages["rienet"])
+    return whole_network_task(config, loss, validate)

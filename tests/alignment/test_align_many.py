@@ -8,11 +8,12 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from dbdnet_jax.alignment import pose_graph, search, transforms
+from dbdnet_jax.alignment import pose_graph, search
 from dbdnet_jax.alignment import validity as verdict
 from dbdnet_jax.alignment.align import Alignment, Matches
 from dbdnet_jax.alignment.align_many import align_many
 from dbdnet_jax.alignment.success import PoseFeatures
+from dbdnet_jax.ops.transforms import move
 from tests.aligning import POINTS, motion, rotation_error_deg, solid, tiny_params
 from tests.conftest import random_cloud
 
@@ -96,10 +97,10 @@ def test_the_information_is_brought_to_the_sources_frame():
         alignment.transform, alignment.information, alignment.pivot, centre, unit
     )
     step = 1e-6 * random_cloud(5, 6, 1)[:, 0]
-    before = transforms.move(np.linalg.inv(alignment.transform), points)
+    before = move(np.linalg.inv(alignment.transform), points)
     turn = Rotation.from_rotvec(step[:3]).as_matrix()
     after = (before - centre) @ turn.T + centre + unit * step[3:]
-    residual = ((transforms.move(alignment.transform, after) - points) * normals).sum(axis=1) / 0.01
+    residual = ((move(alignment.transform, after) - points) * normals).sum(axis=1) / 0.01
     assert step @ found @ step == pytest.approx(residual @ residual, rel=1e-4)
 
 
@@ -119,9 +120,7 @@ def test_the_poses_are_those_that_move_the_surfaces_least(stand_in):
         residuals = []
         for (i, j), alignment in answers.items():
             points, normals = surface(7 * i + j)
-            there = transforms.move(
-                between(guess, i, j) @ np.linalg.inv(alignment.transform), points
-            )
+            there = move(between(guess, i, j) @ np.linalg.inv(alignment.transform), points)
             residuals.append(((there - points) * normals).sum(axis=1))
         return np.concatenate(residuals)
 
@@ -154,9 +153,7 @@ def test_a_wrong_edge_is_dropped_however_sure_it_is(stand_in, wrong, degrees):
     answers = every_pair(true)
     transform, middle = between(true, *wrong), np.median(cloud(wrong[0]), axis=0)
     turn = transform @ motion(9, degrees, 0.0)
-    turn[:3, 3] += transforms.move(transform, middle) - transforms.move(
-        turn, middle
-    )  # in its place
+    turn[:3, 3] += move(transform, middle) - move(turn, middle)  # in its place
     answers[wrong] = aligned(turn, probability=0.99)
     found = stand_in(answers, 4)
     assert [(edge.source, edge.target) for edge in found.edges if not edge.kept] == [wrong]
@@ -213,7 +210,7 @@ def test_three_scans_of_a_shape_find_together(monkeypatch):
     monkeypatch.setattr(search, "predict_pose", clueless)
     monkeypatch.setattr(verdict, "LIKELY", 0.0)
     true = poses(3, 30.0)
-    clouds = [transforms.move(np.linalg.inv(pose), solid(190, i)) for i, pose in enumerate(true)]
+    clouds = [move(np.linalg.inv(pose), solid(190, i)) for i, pose in enumerate(true)]
     rough = np.array([pose @ motion(i + 5, 3.0, 0.02) for i, pose in enumerate(true)])
     found = align_many(clouds, tiny_params(), initial=rough, max_points=POINTS)
     assert found.connected.all(), found.reasons
