@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from dbdnet_jax.alignment import candidates
 from dbdnet_jax.alignment.candidates import Candidate, choose, far_starts, merged, near_starts, rank
 from dbdnet_jax.alignment.point_to_plane import refine_point_to_plane
-from dbdnet_jax.alignment.success import load_coefficients
+from dbdnet_jax.alignment.success import fit_features, load_coefficients
 from dbdnet_jax.alignment.surfaces import PoseFit, inlier_distance, measure_fit, surface
 from dbdnet_jax.ops.transforms import angle_between, cube_rotations, transform_of, turn_deg
 from dbdnet_jax.types import Transform
@@ -63,6 +63,12 @@ def test_a_guess_is_left_only_for_what_fits_clearly_better():
     some[1] = some[1]._replace(score=1.9 - candidates.CLEARLY)
     assert choose(some, turned(0), MIDDLE) == 0
     assert choose(some, turned(100), MIDDLE) == 0
+
+
+def test_a_pose_that_fits_nowhere_is_bad_by_so_much_and_no_more():
+    features = fit_features(NO_FIT)
+    parts = features.tight, features.tight_per_inlier, features.inliers
+    np.testing.assert_allclose(parts, np.log(0.01))  # the logarithm of a part of 0 is cut off
 
 
 def test_each_pose_is_listed_once():

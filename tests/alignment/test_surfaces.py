@@ -27,3 +27,14 @@ def test_points_in_common_are_told_by_the_targets_own_spacing():
     # a sixth of the target's, half of them would be no nearer than chance has it.
     moved = np.concatenate([points + rng.normal(0, 0.002, points.shape) for _ in range(6)])
     assert shared_point_score(moved, surface(points), 0.1) > 0.7
+
+
+def test_no_evidence_for_points_in_common_is_none_against_them():
+    rng = np.random.default_rng(0)
+    points, others = (rng.uniform(0, 1, (400, 3)) * [1.0, 1.0, 0.0] for _ in range(2))
+    target = surface(points)
+    distance = inlier_distance(target, target)
+    assert shared_point_score(others, target, distance) == 0.0
+    # Just within the reach of inliers: what is beside them is capped at that reach too.
+    lifted = points + [0.0, 0.0, 0.94 * distance]
+    assert shared_point_score(lifted, target, distance) < 0.01
