@@ -29,7 +29,12 @@ from dbdnet_jax.alignment.success import (
     success_probability,
 )
 from dbdnet_jax.alignment.surfaces import Surface, inlier_distance, measure_fit, surface
-from dbdnet_jax.alignment.transforms import Transform, angle_between, move
+from dbdnet_jax.alignment.transforms import (
+    Transform,
+    angle_between,
+    finer_cube_rotations,
+    move,
+)
 from dbdnet_jax.networks.params import Params
 
 LIKELY = 0.5  # success probability of a valid pose
@@ -218,7 +223,7 @@ def mirrored_margin(scene: NormalisedPair, found: Found, coefficients: Coefficie
     flip = np.array([1.0, 1.0, -1.0])
     moved = move(found.pose, source.points)
     mirrored = surface((moved - moved.mean(axis=0)) * flip, source.even)
-    starts = far_starts(mirrored, target)
-    best = examine(starts, mirrored, target, coefficients, keep=4)
+    starts = far_starts(mirrored, target, finer_cube_rotations())  # no network proposes one here
+    best = examine(starts, mirrored, target, coefficients, keep=8)
     own = fit_score(measure_fit(found.pose, source, target, distance), coefficients)
     return best[0].score - own
