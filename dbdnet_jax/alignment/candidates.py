@@ -42,10 +42,13 @@ def near_starts(pose: Transform, source: Surface) -> list[Transform]:
     return [pose, *(_turned(pose, middle, x, a) for a in RESTART_DEG for x in axes)]
 
 
-def far_starts(source: Surface, target: Surface) -> list[Transform]:
-    """The source in 24 orientations, its middle on the target's."""
+def far_starts(
+    source: Surface, target: Surface, turns: Float[np.ndarray, "k 3 3"] | None = None
+) -> list[Transform]:
+    """The source turned by each rotation, the cube's 24 if None, its middle on the target's."""
+    turns = cube_rotations() if turns is None else turns
     middles = source.points[source.even].mean(axis=0), target.points[target.even].mean(axis=0)
-    return [as_transform(turn, middles[1] - turn @ middles[0]) for turn in cube_rotations()]
+    return [as_transform(turn, middles[1] - turn @ middles[0]) for turn in turns]
 
 
 def _turned(pose: Transform, middle: np.ndarray, axis: np.ndarray, degrees: float) -> Transform:

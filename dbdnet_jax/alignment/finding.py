@@ -32,7 +32,7 @@ from dbdnet_jax.alignment.success import (
 )
 from dbdnet_jax.alignment.surfaces import Surface, inlier_distance, measure_fit, surface
 from dbdnet_jax.networks.params import Params
-from dbdnet_jax.ops.transforms import angle_between, move, turn_deg
+from dbdnet_jax.ops.transforms import angle_between, finer_cube_rotations, move, turn_deg
 from dbdnet_jax.types import Transform
 
 LIKELY = 0.5  # success probability of a valid pose
@@ -48,6 +48,8 @@ LEFT_FOR = 0.1
 LAST_RADII = (1.0,) * 6 + (0.7,) * 4 + (0.4,) * 8
 NO_OTHER = 4.0  # the margin where nothing else fits, and the most it counts
 MIRRORED = 1.5  # the score by which a mirrored source must fit better
+# Unless so many matches agree with the answer, and so many times as with any mirrored pose.
+MANY, TELLING = 12, 2.0
 
 
 class Clues(NamedTuple):
@@ -64,11 +66,16 @@ class Found(NamedTuple):
     score: float  # before the last step, as the others' are
     others: list[Candidate]  # different poses, best first
     margin: float  # score of the pose less that of the best other one
-    predicted: NetworkPose
+    clues: Clues
     quality: PoseQuality
     evidence: PoseFeatures
     probability: float
     everywhere: bool
+
+    @property
+    def predicted(self) -> NetworkPose:
+        """The network's answer."""
+        return self.clues.predicted
 
 
 def find_pose(
@@ -194,7 +201,7 @@ def settle(
         chosen.score,
         others,
         margin,
-        clues.predicted,
+        clues,
         quality,
         evidence,
         probability,
@@ -243,8 +250,16 @@ def mirrored_margin(scene: NormalisedPair, found: Found, coefficients: Coefficie
     distance = inlier_distance(source, target)
     flip = np.array([1.0, 1.0, -1.0])
     moved = move(found.pose, source.points)
-    mirrored = surface((moved - moved.mean(axis=0)) * flip, source.even)
-    starts = far_starts(mirrored, target)
-    best = examine(starts, mirrored, target, coefficients, keep=4)
+    middle = moved.mean(axis=0)
+    matched = found.clues.matched
+    # What the surfaces look like does not tell a mirrored one, so the same matches serve.
+    reflected = matched._replace(source=(move(found.pose, matched.source) - middle) * flip)
+    poses = agreed_poses(reflected)
+    most = max((agreement(pose, reflected) for pose in poses), default=0)
+    if agreement(found.pose, matched) > max(MANY, TELLING * most):
+        return -np.inf
+    mirrored = surface((moved - middle) * flip, source.even)
+    starts = far_starts(mirrored, target, finer_cube_rotations())  # no network proposes one here
+    best = examine(starts, mirrored, target, coefficients, keep=8, close=poses)
     own = fit_score(measure_fit(found.pose, source, target, distance), coefficients)
     return best[0].score - own

@@ -63,3 +63,12 @@ def cube_rotations() -> Float[np.ndarray, "24 3 3"]:
     ]
     proper = np.array([x for x in found if np.linalg.det(x) > 0])
     return proper[np.argsort(turn_deg(proper), kind="stable")]
+
+
+def finer_cube_rotations() -> Float[np.ndarray, "48 3 3"]:
+    """Those of a cube, and each of them turned on by 60 degrees about a diagonal: between these."""
+    from scipy.spatial.transform import Rotation
+
+    between = Rotation.from_rotvec(np.full(3, np.pi / 3 / np.sqrt(3))).as_matrix()
+    turns = cube_rotations()
+    return np.concatenate([turns, turns @ between])

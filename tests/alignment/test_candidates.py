@@ -9,7 +9,13 @@ from dbdnet_jax.alignment.candidates import Candidate, choose, far_starts, merge
 from dbdnet_jax.alignment.point_to_plane import refine_point_to_plane
 from dbdnet_jax.alignment.success import fit_features, load_coefficients
 from dbdnet_jax.alignment.surfaces import PoseFit, inlier_distance, measure_fit, surface
-from dbdnet_jax.ops.transforms import angle_between, cube_rotations, transform_of, turn_deg
+from dbdnet_jax.ops.transforms import (
+    angle_between,
+    cube_rotations,
+    finer_cube_rotations,
+    transform_of,
+    turn_deg,
+)
 from dbdnet_jax.types import Transform
 from tests.aligning import motion, solid
 
@@ -28,13 +34,15 @@ def sides():
     return surface(solid(1500, 0)), surface(solid(1500, 1))
 
 
-def test_every_rotation_is_near_one_of_the_cubes():
-    turns = cube_rotations()
-    assert turns.shape == (24, 3, 3)
+@pytest.mark.parametrize(
+    ("turns", "count", "gap"), [(cube_rotations(), 24, 63), (finer_cube_rotations(), 48, 57)]
+)
+def test_every_rotation_is_near_one_of_the_cubes(turns, count, gap):
+    assert turns.shape == (count, 3, 3)
     np.testing.assert_allclose(turns[0], np.eye(3))
     drawn = Rotation.random(500, random_state=0).as_matrix()
     apart = [turn_deg(turns.transpose(0, 2, 1) @ one).min() for one in drawn]
-    assert max(apart) < 63
+    assert max(apart) < gap
 
 
 def test_starts_keep_the_middle_where_it_is(sides):

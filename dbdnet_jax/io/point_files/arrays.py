@@ -67,4 +67,10 @@ def read_kitti(file: BinaryIO, path: Path, seed: int) -> PointFile:
             f"a .bin must be rows of four float32 in metres; read so, it has numbers up to "
             f"{size:g}. Save other kinds as .npy."
         )
+    # Rows of three numbers or of five (nuScenes) put coordinates there, of which some are negative.
+    if (rows[:, 3] < 0).any():
+        raise FileFault(
+            "a .bin must be rows of four float32, the last a reflectance from 0 up; it seems to "
+            "have another number of columns. Save points[:, :3] as .npy."
+        )
     return found

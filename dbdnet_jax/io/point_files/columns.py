@@ -40,7 +40,7 @@ def find_xyz(names: Sequence[str]) -> tuple[int, int, int] | None:
         for family, axis in _roles(name, parts):
             families.setdefault(family, {}).setdefault(axis, []).append(i)
     whole = {f: axes for f, axes in families.items() if set(axes) == {0, 1, 2}}
-    for kind in ("exact", "plain", "other"):
+    for kind in ("exact", "plain", "other", "level"):  # level: x, y and a height
         chosen = [axes for family, axes in whole.items() if family.startswith(kind)]
         if not chosen:
             continue
@@ -74,8 +74,8 @@ def _roles(name: str, words: list[str]) -> list[tuple[str, int]]:
     """Families of three that a column may belong to, and its axis in them."""
     bare = name.strip(" \"'").lower()
     if bare in ("x", "y", "z"):
-        mixed = [("plain surveyed", 2), ("plain short", 2)] if bare == "z" else []
-        return [("exact", AXES[bare]), *mixed]
+        mixed = [("plain surveyed", 2), ("plain short", 2)]
+        return [("exact", AXES[bare]), *(mixed if bare == "z" else [("level", AXES[bare])])]
     places = [i for i, word in enumerate(words) if word in AXES]
     if len(places) == 1:
         word, rest = words[places[0]], [*words[: places[0]], *words[places[0] + 1 :]]
@@ -83,11 +83,13 @@ def _roles(name: str, words: list[str]) -> list[tuple[str, int]]:
             return []
         surveyed = [] if word in "xy" else [("plain surveyed", AXES[word])]
         if word not in "xyz":
-            return surveyed
+            return [*surveyed, *([("level", 2)] if AXES[word] == 2 else [])]
         kind = "other" if set(rest) - PLAIN else "plain"
-        return [(f"{kind} {' '.join(rest)}", AXES[word]), *surveyed]
+        level = [("level", AXES[word])] if kind == "plain" and word != "z" else []
+        return [(f"{kind} {' '.join(rest)}", AXES[word]), *surveyed, *level]
     if len(words) == 1 and words[0] in SHORT:
-        return [("plain short", SHORT[words[0]])]
+        level = [("level", 2)] if words[0] == "h" else []
+        return [("plain short", SHORT[words[0]]), *level]
     if len(words) == 2 and words[0] in COUNTED and words[1] in "0123":
         number = int(words[1])
         return [

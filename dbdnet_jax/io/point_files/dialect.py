@@ -1,25 +1,17 @@
 """How a table of text is written: its separator, decimal mark, head and columns, or a refusal."""
 
-import csv
+import itertools
 import re
 from typing import NamedTuple
 
-from dbdnet_jax.io.point_files.columns import find_xyz
+from dbdnet_jax.io.point_files.heads import named_columns, promised, require_table
+from dbdnet_jax.io.point_files.lines import cells, uncommented
 from dbdnet_jax.io.point_files.numbers import parse
 from dbdnet_jax.io.point_files.record import FileFault
 
-COMMENTS = ("#", "//", "%", "!")
-KEYWORD = re.compile(
-    r"^\s*(?:file\s+)?(?:fields?|columns?|names?|header|format|variables|data)\b\s*[:=]?\s*", re.I
-)
-PROSE = set(
-    """a an and are as at by column columns exported exporter follow follows for from here in is
-    made now of on our per scanned the then these this to units was we were with written""".split()
-)
 THOUSANDS = re.compile(r"[+-]?[1-9][0-9]{0,2}(?:,[0-9]{3})+")
-WAYS = ((";", "."), (";", ","), ("\t", "."), ("\t", ","), (",", "."), ("|", "."), ("|", ","))
+WAYS = tuple(itertools.product(";\t,|", ".,"))
 WAYS_OF_BLANKS = ((None, "."), (None, ","))
-FEWEST = 16  # points of a cloud
 FIXED = 16  # rows with decimal points after which a row without any is no point
 
 
@@ -42,27 +34,6 @@ class Dialect(NamedTuple):
         return " \t\r\n" + (self.separator or "")
 
 
-def uncommented(line: str) -> str:
-    """A line without a comment at its end or its whole."""
-    text = line.lstrip("\ufeff \t")
-    if text.startswith(COMMENTS):
-        return ""
-    if "#" in line and '"' not in line:
-        line = re.split(r"(?<!1\.)#", line, maxsplit=1)[0]  # 1.#QNAN is no comment
-    if "//" in line and '"' not in line:
-        line = line.split("//", 1)[0]
-    return line
-
-
-def cells(line: str, separator: str | None) -> list[str]:
-    """The cells of a row; a separator in quotes separates nothing."""
-    if separator is None:
-        return line.split()
-    if '"' in line:
-        return next(csv.reader([line.strip("\r\n")], delimiter=separator, skipinitialspace=True))
-    return line.strip("\r\n").split(separator)
-
-
 def find_dialect(lines: list[str]) -> Dialect:
     """The one way to read a file's first lines.
 
@@ -70,6 +41,7 @@ def find_dialect(lines: list[str]) -> Dialect:
       FileFault: there is none, or more than one.
     """
     quoted = "its first lines are " + repr("".join(lines[:3])[:160])
+    require_table(lines)
     numbered = [i for i, line in enumerate(lines) if _numbers(uncommented(line)) >= 3]
     if not numbered:
         raise FileFault(f"no line has three numbers; {quoted}. Write a line for each point.")
@@ -79,7 +51,8 @@ def find_dialect(lines: list[str]) -> Dialect:
     width = max(_width(row, separator) for row in rows)
     first = _first_row(lines, numbered, rows, separator, decimal)
     head = [line for line in lines[:first] if line.strip()]
-    named = _named_columns(head, rows, separator, width, quoted)
+    _check_head(head, width, separator, decimal)
+    named = named_columns(head, rows, separator, width, quoted)
     columns = named or [0, 1, 2]
     start = uncommented(next(lines[i] for i in numbered if i >= first))
     _check_columns(rows, columns, separator, decimal, quoted)
@@ -92,7 +65,7 @@ def find_dialect(lines: list[str]) -> Dialect:
         )
     return Dialect(
         separator, decimal, width, columns, named is not None, first,
-        _promised(head), all(whole), quoted,
+        promised(head), all(whole), quoted,
     )  # fmt: skip
 
 
@@ -125,11 +98,24 @@ def _first_row(
             if not whole:
                 raise FileFault(
                     f"line {i + 1} has other columns than the rows below it: "
-                    f"{text.strip()[:80]!r}. Remove it, or begin it with #."
+                    f"{text.strip()[:80]!r}. Begin it with # if it is a head; else give every row "
+                    "the same columns."
                 )
         elif worded or parse(cells(text, separator)[0], decimal) is not None:
             return i
     return numbered[len(numbered) // 2]
+
+
+def _check_head(head: list[str], width: int, separator: str | None, decimal: str) -> None:
+    """Refuse a row that would pass for a head, a letter among its numbers."""
+    for line in head:
+        found = cells(uncommented(line), separator)
+        numbers = [x for x in found if parse(x, decimal) is not None]
+        if len(found) == width and len(numbers) > 1 and not all(map(_is_whole, numbers)):
+            raise FileFault(
+                f"the line {line.strip()[:80]!r} above its rows is one but for a cell that is no "
+                "number. Correct it, or begin it with #."
+            )
 
 
 def _all_numbers(line: str, separator: str | None, decimal: str) -> bool:
@@ -221,80 +207,3 @@ def _check_columns(
                     f"column {i + 1} must hold coordinates; got {found[i].strip()[:40]!r}; "
                     f"{quoted}. Name the columns in a head line (label,x,y,z)."
                 )
-
-
-def _promised(head: list[str]) -> int:
-    """The count in a head that is one whole number; others are comments, sizes, versions."""
-    counts = [line.strip() for line in head if line.strip().isdecimal()]
-    count = int(counts[0]) if len(counts) == 1 and len(counts[0]) < 16 else 0
-    return count if count >= FEWEST else 0  # below: a version, a number of the scan
-
-
-def _named_columns(
-    head: list[str], rows: list[str], separator: str | None, width: int, quoted: str
-) -> list[int] | None:
-    """Where a head says that x, y and z stand; None if it does not say."""
-    found: set[tuple[int, int, int]] = set()
-    unknown = ""
-    for line in head:
-        comment = line.lstrip("\ufeff \t").startswith(COMMENTS)
-        text = line.lstrip("\ufeff \t").lstrip("#/%! ").strip("\r\n")
-        for names in _readings(text, separator, width):
-            if (comment or separator is None) and _is_prose(names):
-                continue
-            try:
-                xyz = find_xyz(names)
-            except ValueError as error:
-                raise FileFault(str(error)) from None
-            if xyz is not None and len(names) == width:
-                found.add(xyz)
-            elif xyz is not None and not comment and (separator or xyz != (0, 1, 2)):
-                raise FileFault(
-                    f"its head names {len(names)} columns and its rows have {width}; {quoted}. "
-                    "Name every column."
-                )
-            elif xyz is None and len(names) == width > 3 and (separator or not comment):
-                unknown = unknown or line.strip()[:80]
-            if xyz == (0, 1, 2) and width == len(names) + 1 and _counts(rows, separator):
-                raise FileFault(
-                    f"its head names {len(names)} columns, its rows have {width} and begin with "
-                    f"their number; {quoted}. Name every column."
-                )
-    if len(found) > 1:
-        raise FileFault(f"its heads name different columns; {quoted}. Keep one of them.")
-    if not found and unknown and not _is_units(unknown):
-        raise FileFault(
-            f"none of its columns is named x, y, z: {unknown!r}. Name these three columns."
-        )
-    return list(found.pop()) if found else None
-
-
-def _readings(text: str, separator: str | None, width: int) -> list[list[str]]:
-    """A head's names, with and without a word before them (FIELDS, columns:)."""
-    marks = [separator] if separator and separator in text else [None]
-    if separator is None:
-        marks = [mark for mark in (";", "\t", ",", "|") if mark in text] or [None]
-    out = []
-    for body in dict.fromkeys((KEYWORD.sub("", text), text)):
-        names = [re.sub(r"^\d+\s*[:.)=]\s*", "", x.strip(" \"'")) for x in cells(body, marks[0])]
-        while len(names) > width and not names[-1]:
-            names.pop()
-        if any(x.strip() for x in names):
-            out.append(names)
-    exact = [names for names in out if len(names) == width]
-    return exact[:1] or out[:1]
-
-
-def _is_prose(names: list[str]) -> bool:
-    return bool(PROSE.intersection(x.lower().strip(".,:") for x in names))
-
-
-def _is_units(line: str) -> bool:
-    return not set(re.findall(r"[a-z]+", line.lower())) - {"m", "mm", "cm", "km", "ft", "in"}
-
-
-def _counts(rows: list[str], separator: str | None) -> bool:
-    """Whether the first column of all rows goes up by one."""
-    first = [parse(cells(row, separator)[0]) for row in rows]
-    steps = zip([None, *first], first, strict=False)
-    return all(b is not None and (a is None or b - a == 1) for a, b in steps)

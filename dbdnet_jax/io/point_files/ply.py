@@ -1,29 +1,21 @@
-"""PLY through plyfile, its head put in order first: programs write it with many liberties."""
+"""PLY: its head, which programs write with many liberties, its vertices and its faces."""
 
-import io
 import re
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO
 
 import numpy as np
 from jaxtyping import Int
 
 from dbdnet_jax.io.point_files.columns import find_xyz
+from dbdnet_jax.io.point_files.ply_rows import AGAIN, Columns, Element, read_rows
 from dbdnet_jax.io.point_files.record import FileFault, PointFile
 from dbdnet_jax.io.point_files.surface import sample, triangles
 
 HEAD_BYTES = 1 << 20
-AGAIN = "Export it again."
 END = re.compile(rb"(?i)(?:^|[\r\n])[ \t]*end_header[ \t]*(\r\n|\n|\r|$)")
 FACES = ("vertex_indices", "vertex_index")
-
-
-class Element(NamedTuple):
-    """One kind of row that a PLY holds."""
-
-    name: str
-    count: int  # type: ignore[assignment]  # not tuple.count
-    properties: tuple[tuple[str, ...], ...]
+SPARE = 6  # bytes after all rows: of less no row is made
 
 
 def read_ply(file: BinaryIO, path: Path, seed: int) -> PointFile:
@@ -43,13 +35,17 @@ def read_ply(file: BinaryIO, path: Path, seed: int) -> PointFile:
     xyz = find_xyz(scalars)
     if xyz is None:
         raise FileFault(f"its vertices must have x, y, z; they have {scalars}. {AGAIN}")
-    found = _parse(kind, elements[:needed], body)
-    rows = found["vertex"].data
+    found, rest = read_rows(kind, elements[:needed], body)
+    rows = found[names.index("vertex")]
     vertices = np.stack([rows[scalars[i]].astype(np.float64) for i in xyz], axis=1)
     faces = np.empty((0, 3), np.int64)
     if surface:
-        faces = _faces(found[surface].data, elements[names.index(surface)])
-    return sample(vertices, faces, seed)
+        faces = _faces(found[names.index(surface)], elements[names.index(surface)])
+    points, notes = sample(vertices, faces, seed)
+    if needed == len(elements) and len(rest.strip(b"\0\r\n\t ")) >= SPARE:
+        count = elements[-1].count
+        notes = (f"{len(rest)} bytes after its {count} rows of {names[-1]} were not read", *notes)
+    return PointFile(points, notes)
 
 
 def _read_head(data: bytes) -> tuple[str, list[Element], bytes]:
@@ -78,46 +74,18 @@ def _read_head(data: bytes) -> tuple[str, list[Element], bytes]:
     return kind, elements, data[after:]
 
 
-def _parse(kind: str, elements: list[Element], body: bytes) -> Any:
-    from plyfile import PlyData, PlyElementParseError
-
-    head = f"ply\nformat {kind} 1.0\n"
-    for name, count, properties in elements:
-        head += f"element {name} {count}\n"
-        head += "".join(f"property {' '.join(words)}\n" for words in properties)
-    if kind == "ascii":
-        if b"\n" not in body:
-            body = body.replace(b"\r", b"\n")
-        body = re.sub(rb"(?m)^[ \t\r]*\n", b"", body)
-    whole = f"{head}end_header\n".encode() + body
-    lists = [words[-1] for words in elements[-1].properties if words[0] == "list"]
-    if elements[-1].name == "face" and len(lists) == 1:
-        try:  # triangles alone, as most meshes have: a hundred times as fast
-            return PlyData.read(io.BytesIO(whole), known_list_len={"face": {lists[0]: 3}})
-        except PlyElementParseError:
-            pass
-    try:
-        return PlyData.read(io.BytesIO(whole))
-    except PlyElementParseError as error:
-        place = f", row {error.row}" if error.row is not None else ""
-        name = error.element.name if error.element is not None else "element"
-        count = next((x.count for x in elements if x.name == name), 0)
-        raise FileFault(
-            f"its {count} rows of {name} are not all there: {error.message}{place} of {count}. "
-            f"{AGAIN}"
-        ) from error
-
-
-def _faces(rows: np.ndarray, element: Element) -> Int[np.ndarray, "f 3"]:
+def _faces(rows: Columns, element: Element) -> Int[np.ndarray, "f 3"]:
     lists = [words[-1] for words in element.properties if words[0] == "list"]
     name = next((x for x in FACES if x in lists), lists[0] if lists else None)
     if name is None:
         raise FileFault(f"its faces have no list of vertices. {AGAIN}")
     column = rows[name]
     if column.dtype != object:
-        return column.astype(np.int64).reshape(len(column), -1)
+        if (column % 1 != 0).any():  # of text
+            raise FileFault(f"a corner of its faces is no whole number. {AGAIN}")
+        column = column.astype(np.int64)
     if element.name == "face":
-        return triangles([polygon.tolist() for polygon in column])
+        return triangles(column)
     found = []
     for strip in column:  # -1 ends a strip; every further vertex makes a triangle
         for part in np.split(strip, np.flatnonzero(strip < 0)):

@@ -51,7 +51,10 @@ def read_point_file(source: Any, name: str = "source", *, seed: int = 0) -> Poin
     path = Path(source)
     points, notes = read_file(path, seed)
     label = f"{name} ({path.name})"
-    checked = check_points(points, label)
+    try:
+        checked = check_points(points, label)
+    except ValueError as error:
+        raise ValueError(" ".join((str(error), *(f"({note}.)" for note in notes)))) from error
     return PointFile(checked, tuple(f"{label}: {note}" for note in notes))
 
 

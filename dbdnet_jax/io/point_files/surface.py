@@ -70,8 +70,11 @@ def _draw(corners: np.ndarray, area: np.ndarray, seed: int) -> Float[np.ndarray,
     return a + u * (b - a) + v * (c - a)
 
 
-def triangles(polygons: list[list[int]]) -> Int[np.ndarray, "f 3"]:
+def triangles(polygons: np.ndarray | list[list[int]]) -> Int[np.ndarray, "f 3"]:
     """Fans of the polygons' first corners; what has fewer than three corners has no area."""
+    if isinstance(polygons, np.ndarray) and polygons.ndim == 2:
+        first = np.repeat(polygons[:, :1], max(polygons.shape[1] - 2, 0), axis=1)
+        return np.stack([first, polygons[:, 1:-1], polygons[:, 2:]], axis=2).reshape(-1, 3)
     found = [
         (polygon[0], second, third)
         for polygon in polygons

@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from dbdnet_jax.io.point_files import ptx
-from dbdnet_jax.io.point_files.dialect import Dialect, cells, find_dialect, uncommented
+from dbdnet_jax.io.point_files.dialect import Dialect, find_dialect
+from dbdnet_jax.io.point_files.lines import cells, uncommented
 from dbdnet_jax.io.point_files.numbers import parse, table
 from dbdnet_jax.io.point_files.record import FileFault, PointFile, drop_unmeasured
 
@@ -74,7 +75,7 @@ def _lines(stream: io.TextIOWrapper) -> Iterator[str]:
     while line := stream.readline(SAMPLE_BYTES):
         if len(line) == SAMPLE_BYTES:
             raise FileFault("a line is longer than a megabyte. Write a line for each point.")
-        yield line
+        yield line if line.isascii() else line.replace("\u2212", "-")  # typographers' minus
 
 
 class _Rows:

@@ -37,8 +37,25 @@ def write_las(path, points):
 
 def write_e57(path, points):
     archive = pytest.importorskip("pye57").E57(str(path), mode="w")
-    archive.write_scan_raw({f"cartesian{axis}": points[:, i] for i, axis in enumerate("XYZ")})
+    mark = np.float32(0.123456789)  # pye57 does not write NaN
+    marked = np.nan_to_num(points, nan=mark)
+    archive.write_scan_raw({f"cartesian{axis}": marked[:, i] for i, axis in enumerate("XYZ")})
     archive.close()
+    raw = path.read_bytes()
+    pages = (raw[i : i + 1020] for i in range(0, len(raw), 1024))  # a checksum ends each
+    content = b"".join(pages).replace(mark.tobytes(), np.float32(np.nan).tobytes())
+    pages = (content[i : i + 1020] for i in range(0, len(content), 1020))
+    path.write_bytes(b"".join(page + struct.pack(">I", crc32c(page)) for page in pages))
+
+
+def crc32c(data: bytes) -> int:
+    """Castagnoli's checksum, bit by bit."""
+    crc = 0xFFFFFFFF
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0x82F63B78 if crc & 1 else 0)
+    return crc ^ 0xFFFFFFFF
 
 
 def write_kitti(path, points):
@@ -77,13 +94,31 @@ def test_a_file_cut_short_is_refused(tmp_path, ending):
         read_point_file(path)
 
 
-@pytest.mark.parametrize("ending", ["pcd", "ply", "bin", "npy"])  # pye57, laspy: not written
+@pytest.mark.parametrize("ending", ["pcd", "ply", "bin", "npy", "e57"])
 def test_rows_that_are_no_number_are_dropped_and_counted(tmp_path, ending):
     WRITERS[ending](tmp_path / f"a.{ending}", HOLED)
     found = read_point_file(tmp_path / f"a.{ending}")
     kept = POINTS[np.isfinite(HOLED).all(axis=1)]
     np.testing.assert_allclose(found.points, kept, atol=1e-6)
     assert found.notes == (f"source (a.{ending}): {LOST}",)
+
+
+@pytest.mark.parametrize("ending", ["las", "laz"])
+def test_coordinates_that_a_scale_of_nan_makes_are_dropped_and_counted(tmp_path, ending):
+    path = tmp_path / f"a.{ending}"
+    write_las(path, POINTS)  # whole numbers: only the head's scale can be none
+    data = bytearray(path.read_bytes())
+    data[131:139] = struct.pack("<d", np.nan)
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"got 0. Give more points. \(40 of 40 points have NaN"):
+        read_point_file(path)
+
+
+@pytest.mark.parametrize("columns", [3, 5])
+def test_a_bin_of_other_rows_than_four_numbers_is_refused(tmp_path, columns):
+    np.c_[POINTS, np.ones((40, 2))][:, :columns].astype("<f4").tofile(tmp_path / "a.bin")
+    with pytest.raises(ValueError, match="another number of columns. Save points"):
+        read_point_file(tmp_path / "a.bin")
 
 
 def pcd(fields: str, size: str, kind: str, body: bytes, data: str = "ascii", n: int = 40) -> bytes:

@@ -32,6 +32,17 @@ READ = {
     "counted.pts": "40\n" + rows(PLAIN + " 5 1 2 3"),
     "pandas.csv": ",x,y,z\n" + rows("{0},{1:.5f},{2:.5f},{3:.5f}"),
     "windows.xyz": rows(PLAIN).replace("\n", "\r\n"),
+    "dos.xyz": rows(PLAIN).replace("\n", "\r\n") + "\x1a",
+    "mac.xyz": rows(PLAIN).replace("\n", "\r"),
+    "blank.xyz": "\n  \n" + rows(PLAIN).replace("\n", "\n\n"),
+    "remarks.txt": rows(PLAIN + "  # point {0}") + "# the end\n",
+    "exponents.xyz": rows("{1:.8e} {2:+.8E} {3:.8e}"),
+    "typeset.txt": rows(PLAIN).replace("-", "\u2212"),
+    "excel.csv": "sep=;\nx;y;z\n" + rows("{1:.5f};{2:.5f};{3:.5f}").replace(".", ","),
+    "sheets.csv": "x,y,z\n" + rows('"{1:.5f}","{2:.5f}","{3:.5f}"').replace(".", ","),
+    "heights.csv": "P;X;Y;Altitude\n" + rows("P{0};{1:.5f};{2:.5f};{3:.5f}"),
+    "metric heights.csv": "x_m,y_m,n,h\n" + rows("{1:.5f},{2:.5f},7,{3:.5f}"),
+    "tecplot.txt": 'VARIABLES = "X", "Y", "Z"\nZONE I=40, F=POINT\n' + rows(PLAIN),
 }
 
 
@@ -53,6 +64,16 @@ REFUSED = {
     "cut.pts": ("90\n" + rows(PLAIN), "promises 90 rows, and it holds 40"),
     "short.txt": (rows(PLAIN) + "1.5 2.5\n" + rows(PLAIN), "line 41 must have 3 columns"),
     "word.txt": (rows(PLAIN) + "1.5 2.5 x\n", "line 41|numbers"),
+    "letter.xyz": ("O.5 1.5 2.5\n" + rows(PLAIN), "one but for a cell that is no number"),
+    "worded.txt": ("x1.5 2.5 3.5 4\n" + rows(PLAIN + " 7"), "but for a cell that is no number"),
+    "raster.asc": ("ncols 3\nnrows 40\ncellsize 1\n" + rows(PLAIN), "it is a raster of heights"),
+    "raster.txt": ("DSAA\n3 40\n0 1\n0 1\n0 9\n" + rows(PLAIN), "it is a raster of heights"),
+    "ply.txt": ("ply\nformat ascii 1.0\nend_header\n" + rows(PLAIN), "it is a PLY"),
+    "ragged.txt": ("1.5 2.5 3.5 4 5\n" + rows(PLAIN + " 1 2 3 4"), "Begin it with # if it"),
+    "two heights.csv": (
+        "x,y,alt,height\n" + rows(PLAIN + " 7").replace(" ", ","),
+        "several of its",
+    ),
     "binary.txt": ("1 2 3\n\0\1\2\0\0\0\0\n", "no text"),
 }
 
@@ -71,6 +92,12 @@ def test_rows_of_nan_are_dropped_and_counted(tmp_path):
     found = read_point_file(tmp_path / "a.csv")
     np.testing.assert_allclose(found.points, POINTS)
     assert found.notes == ("source (a.csv): 3 of 43 points have NaN or infinity and were left out",)
+
+
+def test_too_few_rows_say_how_many_were_dropped(tmp_path):
+    (tmp_path / "a.xyz").write_text(rows(PLAIN, POINTS[:15]) + "nan nan nan\n" * 5)
+    with pytest.raises(ValueError, match=r"16 points; got 15. Give more points. \(5 of 20 points"):
+        read_point_file(tmp_path / "a.xyz")
 
 
 def test_a_ptx_scan_is_moved_by_its_pose_and_loses_what_was_not_seen(tmp_path):
