@@ -71,18 +71,20 @@ def _stacked(pairs: list[Pair]) -> Drawn:
 def row_of(method: Method, pairs: Pair) -> str:
     """Errors, parts of the pairs that are right, and overlap of one set."""
     row = evaluate_method(method, pairs)
-    summary, errors = row.summary, row.errors
-    assert summary is not None and summary.overlap is not None and errors is not None
+    summary, errors, overlap = row.summary, row.errors, row.overlap
+    assert summary is not None and errors is not None and overlap is not None
     right = (errors.rotation_deg < 15) & (errors.translation < 0.2)
-    counts = np.stack(errors.overlap, axis=1)
-    truth = (counts[:, 0] + counts[:, 3]) / counts.sum(axis=1)
-    little = truth < LITTLE
-    correct = (counts[:, 0] + counts[:, 2]) / counts.sum(axis=1)
-    of_little = f"{correct[little].mean():.3f} ({little.sum()})" if little.any() else "-"
+    overlapping = pairs.source_overlap.sum(axis=1) + pairs.target_overlap.sum(axis=1)
+    little = overlapping < LITTLE * (pairs.source.count + pairs.target.count)
+    of_little = "-"
+    if little.any():
+        few = evaluate_method(method, jax.tree.map(lambda leaf: leaf[little], pairs)).overlap
+        assert few is not None
+        of_little = f"{few.accuracy:.3f} ({little.sum()})"
     return (
         f"{summary.error_rotation_deg:.2f} | {summary.median_rotation_deg:.2f} | "
         f"{summary.error_translation:.3f} | {100 * right.mean():.1f} | "
-        f"{summary.overlap.accuracy:.4f} | {summary.overlap.f1:.4f} | {of_little}"
+        f"{overlap.accuracy:.4f} | {overlap.f1:.4f} | {of_little}"
     )
 
 

@@ -34,6 +34,7 @@ def get_config() -> ConfigDict:
     config.model.dropout = 0.0  # too small to overfit pairs that never repeat
     config.model.min_points = 64
     config.model.iterations = 1  # after each pass
+    config.model.local_geometry = 5
 
     config.data.name = "cad"
     config.train.batch_size = 2  # learns more from as many pairs than 8
