@@ -22,9 +22,10 @@ from tqdm import tqdm
 
 from dbdnet_jax.alignment.align import MAX_POINTS, align
 from dbdnet_jax.alignment.candidates import Candidate, examine, far_starts, merged, near_starts
-from dbdnet_jax.alignment.finding import settle, with_incumbent
+from dbdnet_jax.alignment.consensus import agreed_poses, match_surfaces
+from dbdnet_jax.alignment.finding import Clues, find_clues, settle, with_incumbent
 from dbdnet_jax.alignment.normalised import as_given, normalise_pair
-from dbdnet_jax.alignment.search import NetworkPose, predict_pose
+from dbdnet_jax.alignment.search import NetworkPose
 from dbdnet_jax.alignment.success import (
     SUCCESS_DEG,
     SUCCESS_FILE,
@@ -80,13 +81,16 @@ def find(params: Params, pair: ScanPair, coefficients: Coefficients) -> Record:
     """The poses of a pair."""
     scene = normalise_pair(pair.source, pair.target, "auto", MAX_POINTS, np.eye(4))
     source, target = scene.source.surface, scene.target.surface
-    predicted = predict_pose(params, scene.source.sparse, scene.target.sparse)
+    predicted, matched = find_clues(params, scene)
     lists = [
         [
             (x.pose.tolist(), x.fit, is_right(as_given(x.pose, scene), pair))
-            for x in examine(starts, source, target, coefficients)
+            for x in examine(starts, source, target, coefficients, close=close)
         ]
-        for starts in (near_starts(predicted.transform, source), far_starts(source, target))
+        for starts, close in (
+            (near_starts(predicted.transform, source), agreed_poses(matched)),
+            (far_starts(source, target), []),
+        )
     ]
     overlaps = predicted.source_overlap.tolist(), predicted.target_overlap.tolist()
     return Record(*lists, predicted.transform.tolist(), *overlaps)
@@ -126,8 +130,9 @@ def judged(
     every = merged(near, far, middle=scene.source.surface.points.mean(axis=0))
     sides = scene.source.surface, scene.target.surface
     near, every = (with_incumbent(x, predicted, *sides, coefficients) for x in (near, every))
+    clues = Clues(predicted, match_surfaces(*sides))
     for some, everywhere in ((near, False), (every, True)):
-        found = settle(scene, some, predicted, coefficients, None, everywhere=everywhere)
+        found = settle(scene, some, clues, coefficients, None, everywhere=everywhere)
         yield found.evidence, is_right(as_given(found.pose, scene), pair), everywhere
 
 

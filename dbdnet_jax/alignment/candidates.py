@@ -60,14 +60,18 @@ def examine(
     source: Surface,
     target: Surface,
     coefficients: Coefficients,
+    *,
     keep: int = KEPT,
+    close: list[Transform] | None = None,
 ) -> list[Candidate]:
-    """Refine starts on few points, the best of them on more, and rank what is left, best first."""
-    if not starts:
-        return []
+    """Refine starts on few points, the best of them on more, and rank what is left, best first.
+
+    Poses that are ``close`` to the truth if they are right at all leave out the first step, whose
+    wide radius would pull them away where little overlaps.
+    """
     rough, residuals = search.refine_each(starts, source, target, search.COARSE)
     middle = source.points.mean(axis=0)
-    rough = [rough[row] for row in _distinct(rough, residuals, middle)[:keep]]
+    rough = [rough[row] for row in _distinct(rough, residuals, middle)[:keep]] + (close or [])
     fine, residuals = search.refine_each(rough, source, target, search.FINE)
     poses = [fine[row] for row in _distinct(fine, residuals, middle)]
     # Normals of few points are rough: there, soft matching may have been nearer the truth.

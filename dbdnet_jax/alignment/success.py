@@ -42,6 +42,7 @@ class PoseFeatures(NamedTuple):
     last_step_angle: float  # the same of the last refinement
     ambiguity_margin: float  # score of the pose less that of the best other one
     ambiguity_count: float  # how many others fit about as well
+    agreeing_matches: float  # logarithm of 1 + the matched surface points that agree, `consensus`
     turn: float  # logarithm of 1 + degrees from the given orientation
     everywhere: float  # 1 where all rotations were searched
 

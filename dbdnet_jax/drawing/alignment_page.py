@@ -58,7 +58,7 @@ def _tiles(alignment: Alignment) -> list[tuple[str, str]]:
     within = f"of the source lies within {alignment.inlier_distance:.3g} of the target"
     rmse = f"{alignment.rmse:.3g}" if np.isfinite(alignment.rmse) else "none"
     return [
-        (f"{alignment.success_probability:.1%}", "probability that the rotation is right to 5°"),
+        (f"{alignment.success_probability:.1%}", "probability of being right to 5° and 5 %"),
         (f"{alignment.inlier_ratio:.1%}", within),
         (rmse, "root mean square distance of these inliers"),
         _turn(alignment),
