@@ -26,7 +26,9 @@ class Cloud(NamedTuple):
     def valid(self) -> Bool[Array, "*stack n"]:
         """Which rows are points; of stacked clouds, of each."""
         count = jnp.asarray(self.count)
-        rows = jnp.arange(self.points.shape[-2]).reshape((1,) * count.ndim + (-1,))
+        rows = jnp.arange(self.points.shape[-2], dtype=count.dtype).reshape(
+            (1,) * count.ndim + (-1,)
+        )
         return rows < count[..., None]
 
 

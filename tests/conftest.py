@@ -24,7 +24,8 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache
     atexit.register(shutil.rmtree, _cache, ignore_errors=True)
 
-import jax  # noqa: E402  the environment is read on import
+import flax.linen  # noqa: E402  the environment is read on import
+import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import optax  # noqa: E402
@@ -58,14 +59,18 @@ def _promoting(function):
 # optax takes powers and cosines of its int32 counts of steps.
 for _name in ("adam", "adamw", "cosine_decay_schedule", "warmup_cosine_decay_schedule"):
     setattr(optax, _name, _promoting(getattr(optax, _name)))
+# Flax asks for the wider one of float32 and the type that is normalised.
+flax.linen.LayerNorm.__call__ = _promoting(flax.linen.LayerNorm.__call__)
 
 
 # Folders and files whose tests are marked fast: together under two minutes on two idle cores.
 FAST = """
 io metrics ops/test_normals.py ops/test_rigid.py ops/test_sinkhorn.py
-networks/test_params.py networks/test_weights.py networks/dbdnet/test_released.py
-data/test_surface.py data/test_modelnet40.py
-test_configs.py test_structure.py test_guards.py
+classical/test_refine.py networks/test_weights.py networks/dbdnet/test_released.py
+data/test_surface.py data/test_modelnet40.py training/test_optimizer.py training/test_stages.py
+alignment/test_candidates.py alignment/test_quality.py alignment/test_surfaces.py
+alignment/test_voxels.py evaluation/test_tables.py drawing/test_evaluation_page.py
+test_structure.py test_guards.py
 """.split()
 
 

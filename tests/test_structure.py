@@ -5,6 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.conftest import FAST
+
 ROOT = Path(__file__).parents[1]
 PACKAGE = "dbdnet_jax"
 MAX_FILE_LINES = 300
@@ -192,3 +194,10 @@ def test_a_planted_long_file_and_a_planted_long_function_are_caught(tmp_path):
         f"dbdnet_jax/a.py has {MAX_FILE_LINES + 1} lines, {MAX_FILE_LINES} are allowed",
         f"tests/c.py: long has {MAX_FUNCTION_LINES + 1} lines, {MAX_FUNCTION_LINES} are allowed",
     ]
+
+
+def test_every_room_has_fast_tests():
+    tests = ROOT / "tests"
+    assert all((tests / name).exists() for name in FAST)
+    rooms = {path.name for path in (ROOT / PACKAGE).iterdir() if (path / "__init__.py").exists()}
+    assert rooms <= {name.split("/")[0] for name in FAST}

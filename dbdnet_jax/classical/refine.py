@@ -168,7 +168,8 @@ def _downsample(cloud: Cloud) -> Cloud:
     """At most MOST_POINTS rows, evenly over the valid ones; padding becomes zeros."""
     size = min(cloud.points.shape[0], MOST_POINTS)
     whole, part = jnp.divmod(jnp.maximum(cloud.count, size), size)
-    rows = jnp.arange(size) * whole + jnp.arange(size) * part // size  # no overflow at 10 million
+    places = jnp.arange(size, dtype=whole.dtype)
+    rows = places * whole + places * part // size  # no overflow at 10 million
     count = jnp.minimum(cloud.count, size)
     return Cloud(jnp.where(prefix_mask(size, count)[:, None], cloud.points[rows], 0.0), count)
 

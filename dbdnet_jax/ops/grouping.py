@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from dbdnet_jax.ops.rigid import HIGHEST
+from dbdnet_jax.ops.sampling import prefix_mask
 
 
 def squared_distances(a: Float[Array, "n d"], b: Float[Array, "m d"]) -> Float[Array, "n m"]:
@@ -27,13 +28,13 @@ def knn(
     """
     found = min(k, points.shape[0])
     distance = squared_distances(jax.lax.stop_gradient(query), jax.lax.stop_gradient(points))
-    distance = jnp.where(jnp.arange(points.shape[0]) < count, distance, jnp.inf)
+    distance = jnp.where(prefix_mask(points.shape[0], count), distance, jnp.inf)
     # The barrier keeps XLA's simplifier from merging the slices below into the selection, which
     # turns it into a full sort on CPU (27 times slower at 717 points). On the indices alone:
     # around both results XLA's compiler aborts the process under shard_map on several devices.
     index = jax.lax.optimization_barrier(jax.lax.top_k(-distance, found)[1])
     index = jnp.pad(index, ((0, 0), (0, k - found)))
-    return jnp.where(jnp.arange(k) < jnp.minimum(count, found), index, index[:, :1])
+    return jnp.where(prefix_mask(k, jnp.minimum(count, found)), index, index[:, :1])
 
 
 def interpolation_weights(

@@ -10,9 +10,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from dbdnet_jax.types import Points
 
 
-def prefix_mask(n: int, count: Int[Array, ""]) -> Bool[Array, " n"]:
+def prefix_mask(n: int, count: Int[Array, ""] | Float[Array, ""]) -> Bool[Array, " n"]:
     """True for the first ``count`` of n rows: the valid points of a cloud of static size."""
-    return jnp.arange(n) < count
+    return jnp.arange(n, dtype=jnp.result_type(count)) < count
 
 
 def divisor(count: Int[Array, "*stack"], dtype: jnp.dtype) -> Float[Array, "*stack"]:
@@ -44,7 +44,7 @@ def farthest_order(
     their order.
     """
     n = points.shape[0]
-    rows = jnp.arange(n)
+    rows = jnp.arange(n, dtype=jnp.result_type(count))
     sampled = jnp.minimum(count, size) if size else count // 2
     # Padding starts below every distance, so that it is never the farthest.
     start = jnp.where(rows < count, jnp.inf, -1.0).astype(points.dtype)
@@ -60,7 +60,7 @@ def farthest_order(
         return jnp.where(rows == last, -1.0, nearer), last
 
     _, taken = jax.lax.scan(step, start, length=min(n, size) or n // 2)
-    place = jnp.arange(taken.shape[0])
+    place = jnp.arange(taken.shape[0], dtype=rows.dtype)
     rank = jnp.where(rows < count, n + rows, 2 * n + rows)
     rank = rank.at[jnp.where(place < sampled, taken, n)].set(place, mode="drop")
     return jnp.argsort(rank)
@@ -142,6 +142,5 @@ def _largest(
     score: Float[Array, " n"], size: int, count: Float[Array, ""] | Int[Array, ""] | None
 ) -> Int[Array, " size"]:
     if count is not None:
-        rows = jnp.arange(score.shape[0], dtype=jnp.result_type(count))
-        score = jnp.where(rows < count, score, -jnp.inf)
+        score = jnp.where(prefix_mask(score.shape[0], count), score, -jnp.inf)
     return jnp.sort(jax.lax.top_k(score, size)[1])

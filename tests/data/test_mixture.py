@@ -124,7 +124,11 @@ def test_points_are_drawn_by_weight_and_none_twice():
         rows, count = scans.sample(jax.random.key(1), surface, weight, 100, jnp.asarray(spaced))
         assert count == 100 and len(set(np.asarray(rows))) == 100 and rows.max() < 150
     rows, count = scans.sample(
-        jax.random.key(1), surface, weight * (jnp.arange(400) < 40), 100, jnp.asarray(True)
+        jax.random.key(1),
+        surface,
+        jnp.where(jnp.arange(400) < 40, weight, 0.0),
+        100,
+        jnp.asarray(True),
     )
     assert count == 40 and set(np.asarray(rows[:40])) == set(range(40))
 

@@ -82,7 +82,7 @@ def test_the_derivative_of_dense_norm_is_that_of_finite_differences(x64):
             "norm": {"scale": scale, "bias": layer["norm"]["bias"]},
         }
         out = DenseNorm(8, 4).apply({"params": changed}, x, valid)
-        return jnp.sum(jnp.sin(out) * valid[:, None])
+        return jnp.sum(jnp.sin(out) * valid[:, None].astype(out.dtype))
 
     kernel, scale = layer["conv"]["kernel"], layer["norm"]["scale"]
     check_gradients(total, random_cloud(6, N, 5), kernel, scale)

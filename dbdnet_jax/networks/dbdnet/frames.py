@@ -23,7 +23,8 @@ def stack_clouds(source: Cloud, target: Cloud) -> Cloud:
     """Two clouds of any static sizes as one stack; padding, as everywhere, changes nothing."""
     size = max(source.points.shape[0], target.points.shape[0], FEWEST_ROWS)
     points = jnp.stack([pad_rows(source.points, size), pad_rows(target.points, size)])
-    points = points.astype(jnp.promote_types(points.dtype, jnp.float32))
+    if points.dtype != jnp.float64:  # half precision, and whole numbers
+        points = points.astype(jnp.float32)
     return Cloud(points, jnp.stack([jnp.asarray(source.count), jnp.asarray(target.count)]))
 
 

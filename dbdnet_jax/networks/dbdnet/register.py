@@ -180,7 +180,8 @@ def select(
     keep = probability > threshold
     enough = jnp.sum(keep) >= at_least
     order = jnp.where(enough, prefix_order(keep), jnp.argsort(-probability, stable=True))
-    return order, jnp.where(enough, jnp.sum(keep), jnp.minimum(at_least, count))
+    kept = jnp.sum(keep).astype(jnp.result_type(count))
+    return order, jnp.where(enough, kept, jnp.minimum(at_least, count))
 
 
 def _register(
@@ -210,6 +211,7 @@ def _register(
     back = jnp.take_along_axis(jnp.take_along_axis(order, chosen, axis=1), sampled, axis=1)
     from_caller = jax.vmap(inverse_order)(back)
     rows, columns = from_caller[0, : sizes[0]], from_caller[1, : sizes[1]]
+    count = count.astype(rows.dtype)
     branches = [
         Branch(matrix[rows][:, columns], target[rows], jnp.sum(matrix, axis=1)[rows])
         for matrix, target in zip(correspondence, targets, strict=True)
