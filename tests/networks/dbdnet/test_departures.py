@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from configs import modelnet
-from dbdnet_jax.networks.dbdnet import register as dbdnet
+from dbdnet_jax.networks.dbdnet import iterations as solving
 from dbdnet_jax.networks.dbdnet.register import predict_overlap, register_given_overlap
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.ops.sampling import farthest_order
@@ -53,7 +53,8 @@ class StandIn:
             self.encoded.append(second)
             return clouds.points
         row, column = (jnp.arange(clouds.points.shape[1]) < count for count in clouds.count)
-        return jnp.stack(matches(clouds.points, second, row[:, None] & column[None]))
+        valid = (row[:, None] & column[None]).astype(clouds.points.dtype)
+        return jnp.stack(matches(clouds.points, second, valid))
 
 
 def registered(released: bool, iterations: int):
@@ -81,7 +82,7 @@ def registered(released: bool, iterations: int):
 @pytest.mark.parametrize("iterations", [1, 2])
 @pytest.mark.parametrize("released", [False, True])
 def test_solves_coordinates_and_iterations(released, iterations, monkeypatch, x64):
-    monkeypatch.setattr(dbdnet, "RegistrationNetwork", StandIn)
+    monkeypatch.setattr(solving, "RegistrationNetwork", StandIn)
     monkeypatch.setattr(StandIn, "encoded", [])
     config = dataclasses.replace(SMALL, released=released, iterations=iterations)
     params = Params({"registration": {}}, config)
