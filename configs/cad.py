@@ -5,7 +5,7 @@
 50 + 50 epochs of 642 shapes, 32,100 pairs for each network at about 80 ms of one core: an hour on
 two cores. The weights in the package come of shorter runs, one after the other; docs/training.md
 has their commands and curves. From fresh weights this schedule has not been run to its end. Then
-`--stage=joint` trains both together, 8 epochs at about 150 ms of one core a pair.
+`--stage=joint` trains both together, 8 epochs at about 260 ms of one core a pair.
 """
 
 from ml_collections import ConfigDict
@@ -34,7 +34,7 @@ def get_config() -> ConfigDict:
     config.model.dropout = 0.0  # too small to overfit pairs that never repeat
     config.model.min_points = 64
     config.model.iterations = 1  # after each pass
-    config.model.local_geometry = 5
+    config.model.local_geometry = 5  # all radii: each point knows the surface around it
 
     config.data.name = "cad"
     config.train.batch_size = 2  # learns more from as many pairs than 8

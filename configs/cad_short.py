@@ -16,6 +16,7 @@ from configs import cad
 def get_config() -> ConfigDict:
     """The differences from the full CAD training."""
     config = cad.get_config()
+    config.model.local_geometry = 0  # coordinates only: it is the step that costs here
     config.train.ema_decay = 0.99  # a memory of a hundred steps, of the few thousand there are
     config.train.warmup_epochs = 0.25
     config.train.log_every = 50

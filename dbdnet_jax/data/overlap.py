@@ -44,7 +44,7 @@ def overlap_labels(
     digest.update(target.tobytes())
     file = Path(cache) / f"overlap_{digest.hexdigest()[:32]}.npz"
     try:
-        with np.load(file, allow_pickle=False) as stored:
+        with np.load(io.BytesIO(file.read_bytes()), allow_pickle=False) as stored:
             return (
                 np.unpackbits(stored["source"], count=len(source)).astype(bool),
                 np.unpackbits(stored["target"], count=len(target)).astype(bool),

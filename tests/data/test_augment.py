@@ -88,7 +88,8 @@ def test_crops_leave_a_half_to_all_of_what_was_drawn_by_planes_and_by_balls(monk
 
     def telling(first):
         def crop(points, where, wanted, count):
-            return first + (jnp.arange(wanted) * total >= count * wanted).astype(int)
+            rows = jnp.arange(wanted, dtype=float) * total
+            return first + (rows >= jnp.float32(count) * wanted).astype(int)
 
         return crop
 

@@ -34,7 +34,7 @@ def test_a_method_is_scored_at_every_value_of_what_is_varied(config, tmp_path):
     assert errors[0] < 15 * 3**0.5 and errors[:4] == sorted(errors[:4])
     assert {point.row.summary.pairs for point in points} == {3}
     path = save_sweep("rotation", points, tmp_path / "new", "python evaluate.py")
-    lines = list(csv.DictReader(path.open()))
+    lines = list(csv.DictReader(path.read_text().splitlines()))
     assert [float(line["value"]) for line in lines] == list(SWEEPS["rotation"].values)
     assert {(line["pairs"], line["command"]) for line in lines} == {("3", "python evaluate.py")}
     assert float(lines[0]["error_r"]) == pytest.approx(errors[0], rel=1e-5)

@@ -34,6 +34,7 @@ def config() -> RunConfig:
     config.model.neighbours = 4
     config.model.min_points = 12
     config.model.dropout = 0.1
+    config.model.local_geometry = 0
     config.protocol.points = 64
     config.train.batch_size = 2
     config.train.learning_rate = 3e-3
