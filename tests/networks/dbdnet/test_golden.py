@@ -221,7 +221,7 @@ def test_float32_moves_no_further_than_theirs(b, record_property):
         jnp.asarray(answer.rotation, jnp.float64), jnp.asarray(expected["rotation"])
     )
     moved_probability = np.quantile(
-        np.abs(answer.src_overlap - expected["probability_source"]), 0.99
+        np.abs(np.float64(answer.src_overlap) - expected["probability_source"]), 0.99
     )
     record_property("moved_deg", float(moved_deg))
     record_property("moved_probability", float(moved_probability))
