@@ -177,6 +177,7 @@ def test_a_name_does_not_steer_the_terminal(run, folder):
         assert not {"\x1b", "\u202e"} & set(out + err) and r"a\x1b[2J\u202e.ply" in err
 
 
+@pytest.mark.filterwarnings("always")
 def test_a_warning_is_a_line(run, monkeypatch):
     def warn():
         warnings.warn("odd\x1b", stacklevel=1)
