@@ -39,6 +39,26 @@ def on_a_floor(count: int, seed: int) -> np.ndarray:
     return np.vstack([0.2 * solid(count // 21, seed) + [0, 0, 0.06], floor])
 
 
+def on_a_wide_floor(thing: np.ndarray, count: int, seed: int) -> np.ndarray:
+    """A thing of few points, and a floor some four times as wide."""
+    floor = random_cloud(seed, count - len(thing)) * [1.0, 1.0, 0.0]
+    return np.vstack([thing, floor]) + 0.001 * random_cloud(seed + 9, count)
+
+
+def radiator(count: int, seed: int) -> np.ndarray:
+    """A board: its ends, hardly any of the points, hold it along itself."""
+    board = random_cloud(seed, count // 15) * [0.25, 0.06, 0.12] + [0, 0, 0.15]
+    side = random_cloud(seed + 1, count // 15)[:, 0]
+    board[:, 1] = np.where(side > 0, 0.06, -0.06)
+    end = np.abs(side) < 0.1
+    board[end, 0], board[end, 1] = 0.25, 0.6 * side[end]
+    return on_a_wide_floor(board, count, seed)
+
+
+def bottle(count: int, seed: int) -> np.ndarray:
+    return on_a_wide_floor(cylinder(count // 10, seed) * 0.3 + [0, 0, 0.3], count, seed)
+
+
 def assessed(source: np.ndarray, target: np.ndarray) -> PoseQuality:
     """The quality of no motion between two clouds."""
     sides = surface(source), surface(target)
@@ -53,10 +73,12 @@ def assessed(source: np.ndarray, target: np.ndarray) -> PoseQuality:
         (sphere, "rotation about every axis"),
         (solid, ""),
         (on_a_floor, ""),
+        (radiator, ""),
+        (bottle, "rotation about [0 0 1]"),
     ],
 )
 def test_degenerate_motions_are_named(shape, words):
-    quality = assessed(shape(3000, 1), shape(3000, 2))
+    quality = assessed(shape(9000, 1), shape(9000, 2))
     assert in_words(tuple(_snap(motion) for motion in quality.degenerate_motions)) == words
 
 
