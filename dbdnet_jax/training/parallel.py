@@ -27,7 +27,7 @@ def mean_over_pairs(function: Callable[..., Any], count: int, *arguments: Any) -
     for the same number of devices only, as the order of the sum depends on it.
     """
     if jax.default_backend() != "cpu":
-        values = jax.vmap(lambda i: function(i, *arguments))(jnp.arange(count))
+        values = jax.vmap(lambda i: function(i, *arguments))(jnp.arange(count, dtype=jnp.int32))
         return jax.tree.map(lambda value: jnp.mean(value, axis=0), values)
     function = jax.jit(function)  # traced once, for its shapes and for the sum
     mesh = _cpu_mesh()
@@ -50,7 +50,7 @@ def mean_over_pairs(function: Callable[..., Any], count: int, *arguments: Any) -
         out_specs=PartitionSpec(),
         # Checked, jax.grad inside would sum over the devices by itself, pair by pair.
         check_vma=False,
-    )(jnp.arange(rounds * mesh.size), *arguments)
+    )(jnp.arange(rounds * mesh.size, dtype=jnp.int32), *arguments)
     return jax.tree.map(lambda value: value / count, total)
 
 
@@ -60,7 +60,7 @@ def stack_over_devices(function: Callable[..., Any], count: int) -> Any:
     On a CPU the XLA devices share the rows, and XLA divides what is computed from them the same
     way; where the count is no multiple of the devices, each computes all of it.
     """
-    values = jax.vmap(function)(jnp.arange(count))
+    values = jax.vmap(function)(jnp.arange(count, dtype=jnp.int32))
     if jax.default_backend() != "cpu" or count % jax.device_count():
         return values
     rows = NamedSharding(_cpu_mesh(), PartitionSpec("pairs"))
