@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from dbdnet_jax.alignment.surfaces import Surface
 from dbdnet_jax.classical import refine as em_icp
@@ -42,7 +42,6 @@ class NetworkPose(NamedTuple):
     transform: Transform
     source_overlap: Float[np.ndarray, " n"]
     target_overlap: Float[np.ndarray, " m"]
-    source_kept: Bool[np.ndarray, " n"]
     mass: Float[np.ndarray, "n m"]  # mean of both branches
     confidence: Float[np.ndarray, " n"]
     valid: bool
@@ -61,20 +60,18 @@ def predict_pose(params: Params, source: Points, target: OtherPoints) -> Network
             answer.translation,
             answer.src_overlap,
             answer.tgt_overlap,
-            answer.src_kept,
             sum(branch.correspondence for branch in branches) / 2,
             answer.confidence,
             answer.valid,
         )
 
     answer = _run(repr(config), network, params.networks, *_pad(source, target))
-    rotation, translation, source_overlap, target_overlap, kept, mass, confidence, valid = answer
+    rotation, translation, source_overlap, target_overlap, mass, confidence, valid = answer
     n, m = len(source), len(target)
     return NetworkPose(
         as_transform(rotation, translation),
         source_overlap[:n],
         target_overlap[:m],
-        kept[:n],
         mass[:n, :m],
         confidence[:n],
         bool(valid),

@@ -259,7 +259,7 @@ def _step(scene: _PreparedPair, motion: Rigid, radius: Float[Array, ""]) -> Rigi
     pull = jnp.einsum("nij,nj->ni", metric, moved, precision=HIGHEST)
     pull -= jnp.einsum("nij,nj->ni", own, mean, precision=HIGHEST) + (1 - ISOTROPY) * metric_mean
     identity = jnp.broadcast_to(one, metric.shape)
-    jacobian = jnp.concatenate([-_cross(moved), identity], axis=2)
+    jacobian = jnp.concatenate([-rigid.cross_matrix(moved), identity], axis=2)
     hessian = jnp.einsum("nai,nab,nbj->ij", jacobian, metric, jacobian, precision=HIGHEST)
     gradient = jnp.einsum("nai,na->i", jacobian, pull, precision=HIGHEST)
     # The ridge holds motions that nothing resists; its constant, all of them where none matched.
@@ -283,11 +283,3 @@ def _match(moved: Cloud, target: Cloud, radius: Float[Array, ""]) -> Float[Array
 def _outer(vectors: Float[Array, "n 3"]) -> Float[Array, "n 3 3"]:
     """Each vector times its own transpose."""
     return vectors[:, :, None] * vectors[:, None, :]
-
-
-def _cross(vectors: Float[Array, "n 3"]) -> Float[Array, "n 3 3"]:
-    """The matrix of each vector: ``cross(v) @ x`` is ``v x x``."""
-    x, y, z = vectors.T
-    zero = jnp.zeros_like(x)
-    rows = [jnp.stack(row, axis=1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
-    return jnp.stack(rows, axis=1)

@@ -50,10 +50,17 @@ def rotation_from_euler(angles: Float[Array, "3"]) -> Float[Array, "3 3"]:
     )
 
 
+def cross_matrix(vectors: Float[Array, "*stack 3"]) -> Float[Array, "*stack 3 3"]:
+    """The matrix of each vector: ``cross_matrix(v) @ x`` is ``v x x``."""
+    x, y, z = (vectors[..., i] for i in range(3))
+    zero = jnp.zeros_like(x)
+    rows = [jnp.stack(row, axis=-1) for row in ((zero, -z, y), (z, zero, -x), (-y, x, zero))]
+    return jnp.stack(rows, axis=-2)
+
+
 def rotation_about(axis: Float[Array, "3"], angle: Float[Array, ""]) -> Float[Array, "3 3"]:
     """Rotation about a unit axis by an angle in radians (Rodrigues' formula)."""
-    x, y, z = axis
-    cross = jnp.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], axis.dtype)
+    cross = cross_matrix(axis)
     square = jnp.matmul(cross, cross, precision=HIGHEST)
     return jnp.eye(3, dtype=axis.dtype) + jnp.sin(angle) * cross + (1 - jnp.cos(angle)) * square
 
