@@ -32,7 +32,7 @@ from dbdnet_jax.alignment.success import (
 )
 from dbdnet_jax.alignment.surfaces import Surface, inlier_distance, measure_fit, surface
 from dbdnet_jax.networks.params import Params
-from dbdnet_jax.ops.transforms import angle_between, finer_cube_rotations, move, turn_deg
+from dbdnet_jax.ops.transforms import angle_between, finer_cube_rotations, move
 from dbdnet_jax.types import Transform
 
 LIKELY = 0.5  # success probability of a valid pose
@@ -102,7 +102,7 @@ def find_pose(
         return settle(scene, poses, clues, coefficients, guess, everywhere=False, last=False)
     agreed = agreed_poses(clues.matched)
     if how == "near":
-        agreed = [pose for pose in agreed if turn_deg(pose[:3, :3]) < NEAR_DEG]
+        agreed = [pose for pose in agreed if angle_between(pose, np.eye(4))[0] < NEAR_DEG]
     starts = near_starts(predicted.transform, source) + given
     near = examine(starts, source, target, coefficients, close=given + agreed)
     if guess is None:

@@ -1,16 +1,25 @@
-"""What is found of a mirrored source, wherever the answer has turned it."""
+"""What is searched and found of a pair, and of a mirrored one."""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dbdnet_jax.alignment.consensus import match_surfaces
-from dbdnet_jax.alignment.finding import MIRRORED, Clues, Found, mirrored_margin
+from dbdnet_jax.alignment import finding
+from dbdnet_jax.alignment.candidates import rank
+from dbdnet_jax.alignment.consensus import agreement, match_surfaces
+from dbdnet_jax.alignment.finding import (
+    MIRRORED,
+    Clues,
+    Found,
+    find_pose,
+    last_refined,
+    mirrored_margin,
+)
 from dbdnet_jax.alignment.normalised import as_normalised, normalise_pair
 from dbdnet_jax.alignment.success import fit_score, load_coefficients
-from dbdnet_jax.alignment.surfaces import inlier_distance, measure_fit
-from dbdnet_jax.ops.transforms import transform_of
-from tests.aligning import solid
+from dbdnet_jax.alignment.surfaces import inlier_distance, measure_fit, surface
+from dbdnet_jax.ops.transforms import angle_between, transform_of
+from tests.aligning import POINTS, solid, tiny_params
 
 COEFFICIENTS = load_coefficients()
 
@@ -46,3 +55,43 @@ def test_the_mirrored_pose_is_found_from_every_answer(seed):
     own, margin = score_and_margin(drawn([1, 1, -1]), transform_of(turn, np.zeros(3)))
     assert margin > MIRRORED
     assert own + margin > score_and_margin(STRAIGHT, RIGHT)[0] - 0.5  # as well as unmirrored
+
+
+def turned_scene():
+    """Two dense partial drawings, the source turned by 150 degrees, and the pose between them."""
+    turn = Rotation.from_rotvec([150, 0, 0], degrees=True).as_matrix()
+    source, target = solid(3000, 3), solid(3000, 4)
+    scene = normalise_pair(source[source[:, 0] < 0.4] @ turn, target, "auto", POINTS, np.eye(4))
+    return scene, as_normalised(transform_of(turn, np.zeros(3)), scene)
+
+
+def search_of(scene, how: str) -> Found:
+    options = {"refine": True, "guess": None, "proposals": []}
+    return find_pose(tiny_params(), scene, COEFFICIENTS, how, **options)
+
+
+def test_matches_propose_poses_of_any_rotation(monkeypatch):
+    scene, true = turned_scene()
+    monkeypatch.setattr(finding, "far_starts", lambda *_: [np.eye(4)])  # nothing else leads there
+    found = search_of(scene, "auto")
+    assert angle_between(found.pose, true)[0] < 2
+    agreeing = agreement(found.pose, found.clues.matched)
+    assert agreeing > 20 and found.evidence.agreeing_matches == pytest.approx(np.log1p(agreeing))
+
+
+def test_near_keeps_to_what_is_near():
+    scene, true = turned_scene()
+    found = search_of(scene, "near")
+    poses = [found.pose, *(other.pose for other in found.others)]
+    assert min(angle_between(pose, true)[0] for pose in poses) > 15
+
+
+@pytest.mark.parametrize(("worse", "taken"), [(0.4, True), (0.6, False)])
+def test_the_last_step_is_taken_unless_it_fits_worse(monkeypatch, worse, taken):
+    source = target = surface(solid(3000, 3))
+    start, refined = np.eye(4), transform_of(np.eye(3), np.array([0.01, 0.0, 0.0]))
+    monkeypatch.setattr(finding, "refine_point_to_plane", lambda *_: refined)
+    own = rank([refined], source, target, COEFFICIENTS)[0].score
+    candidate = rank([start], source, target, COEFFICIENTS)[0]._replace(score=own + worse)
+    pose = last_refined(candidate, source, target, COEFFICIENTS).pose
+    assert (pose == (refined if taken else start)).all()
