@@ -10,13 +10,13 @@ from dbdnet_jax.alignment.point_to_plane import refine_point_to_plane
 from dbdnet_jax.alignment.success import Coefficients, fit_score
 from dbdnet_jax.alignment.surfaces import PoseFit, Surface, inlier_distance, measure_fit
 from dbdnet_jax.ops.transforms import (
-    Transform,
     angle_between,
     as_transform,
     cube_rotations,
     move,
     turn_deg,
 )
+from dbdnet_jax.types import Transform
 
 RESTART_DEG = (-30.0, 30.0)  # turns about the principal axes: they lead out of local minima
 KEPT = 12  # of the coarsely refined poses; the right one is not always among the first six

@@ -43,7 +43,7 @@ def _cosines(
     lines: Float[np.ndarray, "e k 3"],
     others: Float[np.ndarray, "e k 3"],
 ) -> list[Float[np.ndarray, "e k"]]:
-    """Line to own normal, line to the other's, and the two normals (this one from 0 to 1)."""
+    """Line to own normal, line to the other's, and the two normals (stretched to -1 to 1)."""
     convex = np.where((normals * lines.sum(axis=1)).sum(axis=1) > 0, -1.0, 1.0)
     normals = normals * convex[:, None]
     between = np.einsum("eki,ei->ek", others, normals)
