@@ -80,14 +80,17 @@ def random_rigid(key: PRNGKeyArray, max_angle: float, max_translation: float) ->
 
 
 @jax.custom_vjp
-def rotation_from_covariance(covariance: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """The rotation R that maximises ``trace(R @ covariance)`` (Kabsch 1976).
+def rotation_from_covariance(
+    covariance: Float[Array, "3 3"],
+) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
+    """The rotation R that maximises ``trace(R @ covariance)``, and singular values (Kabsch 1976).
 
     ``covariance`` is ``sum_i w_i s_i q_i^T`` for R moving s onto q. Always a rotation (det +1);
     its derivative is written out below and stays finite where the singular vectors are not
-    unique (coplanar, collinear or vanishing input).
+    unique (coplanar, collinear or vanishing input). No derivative passes through the singular
+    values, largest first.
     """
-    return _kabsch(covariance)[0]
+    return _rotation_fwd(covariance)[0]
 
 
 def _kabsch(
@@ -102,13 +105,15 @@ def _kabsch(
     return rotation, v, singular * signs
 
 
-def _rotation_fwd(covariance: Float[Array, "3 3"]) -> tuple[Array, tuple[Array, Array, Array]]:
+def _rotation_fwd(
+    covariance: Float[Array, "3 3"],
+) -> tuple[tuple[Array, Array], tuple[Array, Array, Array]]:
     rotation, v, signed = _kabsch(covariance)
-    return rotation, (rotation, v, signed)
+    return (rotation, jnp.abs(signed)), (rotation, v, signed)
 
 
 def _rotation_bwd(
-    residual: tuple[Array, Array, Array], cotangent: Float[Array, "3 3"]
+    residual: tuple[Array, Array, Array], cotangents: tuple[Array, Array]
 ) -> tuple[Float[Array, "3 3"]]:
     """-2 R^T V [(V^T A V)_ij / (b_i + b_j)] V^T with A = (G R^T - R G^T) / 2.
 
@@ -117,7 +122,7 @@ def _rotation_bwd(
     such an axis is of use.
     """
     rotation, v, b = residual
-    generator = jnp.matmul(cotangent, rotation.T, precision=HIGHEST)
+    generator = jnp.matmul(cotangents[0], rotation.T, precision=HIGHEST)
     generator = 0.5 * (generator - generator.T)
     inner = jnp.matmul(jnp.matmul(v.T, generator, precision=HIGHEST), v, precision=HIGHEST)
     gap = b[:, None] + b[None, :]
@@ -153,7 +158,6 @@ def procrustes(
     # The rotation does not depend on the covariance's scale; the clamps of its derivative do.
     scale = jax.lax.stop_gradient(jnp.max(jnp.abs(covariance)))
     covariance = covariance / jnp.where(scale > 0, scale, 1)
-    rotation = rotation_from_covariance(covariance)
+    rotation, singular = rotation_from_covariance(covariance)
     translation = target_centroid - jnp.matmul(rotation, source_centroid, precision=HIGHEST)
-    singular = jnp.linalg.svd(jax.lax.stop_gradient(covariance), compute_uv=False)
     return Rigid(rotation, translation), singular
