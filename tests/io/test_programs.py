@@ -83,7 +83,7 @@ def test_fifty_sizes_are_traced_as_often_as_there_are_buckets(monkeypatch):
         source, target = random_cloud(n, n), random_cloud(m, m)
         proposal = search.predict_pose(tiny_params(), source, target)
         assert proposal.mass.shape == (n, m)
-        assert proposal.source_kept.all() and proposal.target_overlap.all()
+        assert proposal.source_overlap.all() and proposal.target_overlap.all()
         search.refine(proposal.transform, source, target)
     for traces in (networks, refinements):
         assert len(traces) == len(set(traces)) <= len(BUCKETS)
