@@ -33,7 +33,6 @@ def get_config() -> ConfigDict:
     config.model.neighbour_space = "coordinates"  # one search per level instead of ten
     config.model.dropout = 0.0  # too small to overfit pairs that never repeat
     config.model.min_points = 64
-    config.model.iterations = 1  # after each pass
     config.model.local_geometry = 5  # all radii: each point knows the surface around it
 
     config.data.name = "cad"

@@ -24,7 +24,6 @@ LIMITED = dataclasses.replace(
     overlap_points=32,
     registration_points=40,
     neighbour_space="coordinates",
-    iterations=2,
 )
 
 

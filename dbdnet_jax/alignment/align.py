@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from dbdnet_jax.alignment import finding
 from dbdnet_jax.alignment.finding import Found
+from dbdnet_jax.alignment.mirrored import mirror_doubts
 from dbdnet_jax.alignment.normalised import (
     NormalisedCloud,
     NormalisedPair,
@@ -19,7 +20,7 @@ from dbdnet_jax.alignment.normalised import (
     normalise_pair,
 )
 from dbdnet_jax.alignment.search import NetworkPose
-from dbdnet_jax.alignment.success import PoseFeatures, load_coefficients
+from dbdnet_jax.alignment.success import Coefficients, PoseFeatures, load_coefficients
 from dbdnet_jax.alignment.validity import rejection_reason, warnings
 from dbdnet_jax.io.forks import require_own_jax
 from dbdnet_jax.io.point_files import read_point_file
@@ -157,10 +158,9 @@ def align(
         params, scene, coefficients, search, refine=refine, guess=given, proposals=others
     )
     laps["search"] = _clock()
-    reason = rejection_reason(scene, found)
-    reason = reason or (finding.mirror_reason(scene, found, coefficients) if refine else "")
+    reason, doubts = _judge(scene, found, coefficients, refine)
     laps["quality"] = _clock()
-    return _report(scene, found, reason, (*source.notes, *target.notes), laps, loaded)
+    return _report(scene, found, reason, (*source.notes, *target.notes, *doubts), laps, loaded)
 
 
 def _with_threshold(params: Params | None, overlap_threshold: float) -> Params:
@@ -170,6 +170,14 @@ def _with_threshold(params: Params | None, overlap_threshold: float) -> Params:
         raise ValueError("params must hold both networks; one is None. Load a full set of weights.")
     config = dataclasses.replace(params.config, overlap_threshold=float(overlap_threshold))
     return dataclasses.replace(params, config=config)
+
+
+def _judge(
+    scene: NormalisedPair, found: Found, coefficients: Coefficients, refine: bool
+) -> tuple[str, tuple[str, ...]]:
+    """Why the pose is not to be trusted ("" if it is), and warnings; mirrored poses are refined."""
+    reason = rejection_reason(scene, found)
+    return (reason, ()) if reason or not refine else mirror_doubts(scene, found, coefficients)
 
 
 def _report(

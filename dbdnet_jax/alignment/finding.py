@@ -27,12 +27,11 @@ from dbdnet_jax.alignment.success import (
     Coefficients,
     PoseFeatures,
     fit_features,
-    fit_score,
     success_probability,
 )
-from dbdnet_jax.alignment.surfaces import Surface, inlier_distance, measure_fit, surface
+from dbdnet_jax.alignment.surfaces import Surface, inlier_distance
 from dbdnet_jax.networks.params import Params
-from dbdnet_jax.ops.transforms import angle_between, finer_cube_rotations, move
+from dbdnet_jax.ops.transforms import angle_between, move
 from dbdnet_jax.types import Transform
 
 LIKELY = 0.5  # success probability of a valid pose
@@ -46,9 +45,6 @@ LEFT_FOR = 0.1
 # Of the last step, per inlier distance: the smaller the last ones, the nearer the pose comes.
 LAST_RADII = (1.0,) * 6 + (0.7,) * 4 + (0.4,) * 8
 NO_OTHER = 4.0  # the margin where nothing else fits, and the most it counts
-MIRRORED = 1.5  # the score by which a mirrored source must fit better
-# Unless so many matches agree with the answer, and so many times as with any mirrored pose.
-MANY, TELLING = 12, 2.0
 
 
 class Clues(NamedTuple):
@@ -231,34 +227,3 @@ def _overlap_agreement(
     back_again = scene.source.surface.tree.query(move(back, scene.target.sparse))[0] < 2 * distance
     pairs = ((predicted.source_overlap, forth), (predicted.target_overlap, back_again))
     return float(np.mean([np.where(near, p, 1 - p).mean() for p, near in pairs]))
-
-
-def mirror_reason(scene: NormalisedPair, found: Found, coefficients: Coefficients) -> str:
-    """Why the clouds are no images of each other but mirrored ones; "" if they are not."""
-    if mirrored_margin(scene, found, coefficients) < MIRRORED:
-        return ""
-    return (
-        "the source fits clearly better when it is mirrored: is one cloud in a left-handed frame? "
-        "Negate one coordinate of it"
-    )
-
-
-def mirrored_margin(scene: NormalisedPair, found: Found, coefficients: Coefficients) -> float:
-    """The score by which the best pose of the mirrored source beats the answer."""
-    source, target = scene.source.surface, scene.target.surface
-    distance = inlier_distance(source, target)
-    flip = np.array([1.0, 1.0, -1.0])
-    moved = move(found.pose, source.points)
-    middle = moved.mean(axis=0)
-    matched = found.clues.matched
-    # What the surfaces look like does not tell a mirrored one, so the same matches serve.
-    reflected = matched._replace(source=(move(found.pose, matched.source) - middle) * flip)
-    poses = agreed_poses(reflected)
-    most = max((agreement(pose, reflected) for pose in poses), default=0)
-    if agreement(found.pose, matched) > max(MANY, TELLING * most):
-        return -np.inf
-    mirrored = surface((moved - middle) * flip, source.even)
-    starts = far_starts(mirrored, target, finer_cube_rotations())  # no network proposes one here
-    best = examine(starts, mirrored, target, coefficients, keep=8, close=poses)
-    own = fit_score(measure_fit(found.pose, source, target, distance), coefficients)
-    return best[0].score - own

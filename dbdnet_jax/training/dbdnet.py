@@ -117,7 +117,7 @@ def validate_overlap(
 
 def _from_anywhere(model: ModelConfig) -> bool:
     """Whether each turn is trained for itself, from starts such as those before it may leave."""
-    return (model.overlap_passes > 1 or model.iterations > 1) and not model.released
+    return model.overlap_passes > 1
 
 
 def registration_loss_of(
@@ -143,7 +143,6 @@ def registration_loss_of(
         masks = pair.source_overlap, pair.target_overlap
     if start is not None:
         pair = transform_source(pair, start)
-        model = dataclasses.replace(model, iterations=1)
     found = _register_given(model, trainable, pair, masks, dropout_key if model.dropout else None)
     return registration_loss(found, pair, stage.weights)
 
@@ -156,9 +155,8 @@ def validate_registration(
         params = Params({"overlap": frozen, "registration": trainable}, model)
         found = register_clouds(params, pair.source, pair.target)
     else:
-        as_often = dataclasses.replace(model, iterations=model.solves)
         truth = pair.source_overlap, pair.target_overlap
-        found = _register_given(as_often, trainable, pair, truth)
+        found = _register_given(model, trainable, pair, truth, solves=model.solves)
     errors = motion_errors(found.motion, pair.target_from_source)
     return {
         "error": errors.rotation_deg,
@@ -173,10 +171,14 @@ def _register_given(
     pair: Pair,
     masks: tuple[Array, Array],
     dropout_key: PRNGKeyArray | None = None,
+    *,
+    solves: int | None = None,
 ) -> Registration:
     params = Params({"registration": trainable}, model)
     source, target = (mask.astype(pair.source.points.dtype) for mask in masks)
-    return register_given_overlap(params, pair.source, pair.target, source, target, dropout_key)
+    return register_given_overlap(
+        params, pair.source, pair.target, source, target, dropout_key, solves=solves
+    )
 
 
 def joint_turn(
@@ -230,7 +232,6 @@ def joint_loss_of(
     start_key, choice_key, dropout_key = jax.random.split(key, 3)
     start = None
     if _from_anywhere(model):
-        model = dataclasses.replace(model, iterations=1)
         start = joint_start(model, trainable, pair, start_key, choice_key)
     overlap, matched, found, moved = joint_turn(
         model, trainable, pair, start, dropout_key if model.dropout else None

@@ -139,7 +139,7 @@ def test_the_network_is_scored_on_motion_and_overlap(pairs, monkeypatch):
 
 
 def test_the_registration_network_can_be_given_the_true_overlap(pairs, monkeypatch):
-    def given_overlap(params, source, target, source_overlap, target_overlap) -> Registration:
+    def given_overlap(params, source, target, source_overlap, target_overlap, solves):
         return oracle_network(params, source, target, source_overlap * target_overlap)
 
     monkeypatch.setattr(dbdnet, "register_given_overlap", given_overlap)

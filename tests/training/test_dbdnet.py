@@ -29,7 +29,6 @@ def config() -> RunConfig:
     config.model.overlap_channels = config.model.registration_channels = 4
     config.model.overlap_blocks = 1
     config.model.overlap_passes = 1  # more start from another random motion in every step
-    config.model.iterations = 1
     config.model.heads = 2
     config.model.neighbours = 4
     config.model.min_points = 12
@@ -115,7 +114,7 @@ def test_networks_of_several_passes_go_on_from_weights(run_dir, tmp_path, stage)
     save_params(weights, load_best(run_dir))
     config = dataclasses.replace(
         CONFIG,
-        model=dataclasses.replace(CONFIG.model, overlap_passes=2, iterations=2),
+        model=dataclasses.replace(CONFIG.model, overlap_passes=2),
         train=dataclasses.replace(CONFIG.train, start=str(weights)),
     )
     config = config.with_stage("overlap", learning_rate=1e-5)

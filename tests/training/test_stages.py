@@ -16,8 +16,8 @@ from dbdnet_jax.types import Branch, Registration, Rigid
 from tests.conftest import EXACT, FLOAT32, assert_close, random_cloud
 
 SIZE, KEYS = 16, 40
-MODEL = ModelConfig(overlap_matching=True, overlap_passes=3, iterations=2, dropout=0.0)
-ONE_PASS = dataclasses.replace(MODEL, overlap_passes=1, iterations=1)
+MODEL = ModelConfig(overlap_matching=True, overlap_passes=3, dropout=0.0)
+ONE_PASS = dataclasses.replace(MODEL, overlap_passes=1)
 
 
 @pytest.fixture(scope="module")
@@ -40,14 +40,16 @@ def registration(motion: Rigid) -> Registration:
 @pytest.fixture
 def calls(monkeypatch):
     """The starts and models that both networks are asked with; they say that all overlaps."""
-    seen = {"start": [], "iterations": []}
+    seen = {"start": [], "solves": []}
 
     def overlap(params, source, target, dropout_key=None, start=None):
         seen["start"].append(start)
         return jnp.ones(SIZE), jnp.ones(SIZE), None
 
-    def register(params, source, target, source_overlap, target_overlap, dropout_key=None):
-        seen["iterations"].append(params.config.iterations)
+    def register(
+        params, source, target, source_overlap, target_overlap, dropout_key=None, solves=None
+    ):
+        seen["solves"].append(solves)
         return registration(shift(0.0, 1.0, 0.0))
 
     monkeypatch.setattr(dbdnet, "predict_overlap_and_matches", overlap)
@@ -86,7 +88,7 @@ def test_each_turn_of_registration_is_trained_for_itself(pair, calls, monkeypatc
     stage = RegistrationConfig(masks="predicted")
     key = jax.random.key(5)
     dbdnet.registration_loss_of(model, stage, 0.1, {}, {}, pair, key)
-    assert calls["iterations"] == [1]
+    assert calls["solves"] == [None]
     truth = pair.target_from_source
     if starts:
         start = initial_pose(jax.random.split(key, 3)[1], pair)
@@ -99,7 +101,7 @@ def test_each_turn_of_registration_is_trained_for_itself(pair, calls, monkeypatc
 def test_validation_solves_as_often_as_an_answer_does(pair, calls):
     stage = RegistrationConfig(masks="perturbed")
     found = dbdnet.validate_registration(MODEL, stage, {}, None, pair)
-    assert calls["iterations"] == [MODEL.solves] == [6]
+    assert calls["solves"] == [MODEL.overlap_passes]
     assert set(found) == {"error", "translation_error", "loss"}
 
 
@@ -121,5 +123,5 @@ def test_joint_turns_begin_at_joint_starts(pair, calls, monkeypatch, model, expe
     loss, terms = dbdnet.joint_loss_of(
         model, 0.0, dbdnet.LossWeights(), {}, None, pair, jax.random.key(0)
     )
-    assert calls["start"] == [begun if expected else None] and calls["iterations"] == [1]
+    assert calls["start"] == [begun if expected else None] and calls["solves"] == [None]
     assert_close(loss, sum(terms), FLOAT32)

@@ -57,7 +57,7 @@ class ModelConfig:
     local_geometry: int = 0  # radii at which the encoders see the surface around a point
     overlap_threshold: float = 0.5
     min_points: int = 160  # the most probable rows kept when fewer pass the threshold
-    iterations: int = 1
+    iterations: int = 1  # of the registration network; more only where released
     sinkhorn_iterations: int = 5
     released: bool = False
 
@@ -98,6 +98,11 @@ class ModelConfig:
                 )
 
     def _check_combinations(self) -> None:
+        if self.iterations > 1 and not self.released:
+            raise ValueError(
+                "iterations must be 1 unless released=True: outside the released network, "
+                f"overlap_passes repeats both networks; got {self.iterations}. Use 1."
+            )
         if self.overlap_passes > 1 and not self.overlap_matching:
             raise ValueError(
                 "overlap_passes must be 1 without overlap_matching, whose matches give the motion "
@@ -132,7 +137,7 @@ class ModelConfig:
     @property
     def solves(self) -> int:
         """How often `register` solves for the motion."""
-        return self.overlap_passes * self.iterations
+        return max(self.overlap_passes, self.iterations)
 
     @property
     def head_layers(self) -> Layers:

@@ -27,8 +27,9 @@ def iterate(
     kept: Cloud,
     geometry: Float[Array, "2 n g"] | None,
     dropout_key: PRNGKeyArray | None,
+    solves: int,
 ) -> tuple[Rigid, Array, Array, Array, Array]:
-    """Run the registration network ``config.iterations`` times on the selected clouds.
+    """Run the registration network ``solves`` times on the selected clouds.
 
     Returns the motion, the last correspondences and soft targets of both branches (rows in the
     network's order), that order, and whether the last solve was determined.
@@ -56,9 +57,9 @@ def iterate(
         motion = rigid.compose(increment, motion)
         return motion, (increment, matrix, targets, order, solvable)
 
-    keys = None if dropout_key is None else jax.random.split(dropout_key, config.iterations)
+    keys = None if dropout_key is None else jax.random.split(dropout_key, solves)
     start = rigid.identity(kept.points.dtype)
-    motion, steps = jax.lax.scan(once, start, keys, length=config.iterations)
+    motion, steps = jax.lax.scan(once, start, keys, length=solves)
     increment, matrix, targets, order, solvable = jax.tree.map(lambda leaf: leaf[-1], steps)
     # Departure: the released code returns the last increment instead of the composed motion.
     return increment if config.released else motion, matrix, targets, order, solvable

@@ -1,7 +1,5 @@
 """DBDNet as one of the methods of `dbdnet_jax.networks.table`."""
 
-import dataclasses
-
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
@@ -41,9 +39,6 @@ def predict_given_overlap(
     target_overlap: Bool[Array, " m"],
 ) -> Answer:
     """The registration network alone, told which points overlap; solves as often as `register`."""
-    config = dataclasses.replace(params.config, iterations=params.config.solves)
     labels = (label.astype(jnp.float32) for label in (source_overlap, target_overlap))
-    found = register_given_overlap(
-        dataclasses.replace(params, config=config), source, target, *labels
-    )
+    found = register_given_overlap(params, source, target, *labels, solves=params.config.solves)
     return Answer(found.motion)

@@ -153,10 +153,14 @@ def register_given_overlap(
     source_overlap: Float[Array, " n"],
     target_overlap: Float[Array, " m"],
     dropout_key: PRNGKeyArray | None = None,
+    *,
+    solves: int | None = None,
 ) -> Registration:
     """The registration network alone, on the points whose given overlap passes the threshold.
 
     Stage 2 of training, and the way to use a mask of one's own: 0 and 1 are probabilities too.
+    It matches and solves ``solves`` times, each time on the clouds as aligned so far; as often as
+    `ModelConfig.iterations` says, if None.
     """
     clouds = stack_clouds(source, target)
     sizes = (source.points.shape[0], target.points.shape[0])
@@ -164,7 +168,7 @@ def register_given_overlap(
     order = jnp.broadcast_to(jnp.arange(size), (2, size))
     probability = jnp.stack([pad_rows(source_overlap, size), pad_rows(target_overlap, size)])
     geometry = geometry_of(clouds, params.config)
-    return _register(params, clouds, order, probability, sizes, geometry, dropout_key)
+    return _register(params, clouds, order, probability, sizes, geometry, dropout_key, solves)
 
 
 def select(
@@ -192,6 +196,7 @@ def _register(
     sizes: tuple[int, int],
     geometry: Float[Array, "2 rows g"] | None,
     dropout_key: PRNGKeyArray | None = None,
+    solves: int | None = None,
 ) -> Registration:
     """Select, match, solve, and bring everything back to the caller's rows."""
     config = params.config
@@ -200,7 +205,7 @@ def _register(
     )(jax.lax.stop_gradient(probability), clouds.count)
     kept = Cloud(jnp.take_along_axis(clouds.points, chosen[..., None], axis=1), count)
     motion, correspondence, targets, sampled, solvable = iterate(
-        params, kept, reordered(geometry, chosen), dropout_key
+        params, kept, reordered(geometry, chosen), dropout_key, solves or config.iterations
     )
     seen = targets.shape[1]
     count = jnp.minimum(count, seen)

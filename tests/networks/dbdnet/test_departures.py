@@ -84,9 +84,10 @@ def registered(released: bool, iterations: int):
 def test_solves_coordinates_and_iterations(released, iterations, monkeypatch, x64):
     monkeypatch.setattr(solving, "RegistrationNetwork", StandIn)
     monkeypatch.setattr(StandIn, "encoded", [])
-    config = dataclasses.replace(SMALL, released=released, iterations=iterations)
+    config = dataclasses.replace(SMALL, released=released)
     params = Params({"registration": {}}, config)
-    answer = jax.jit(register_given_overlap)(params, whole(SOURCE), whole(TARGET), *MASKS)
+    solve = jax.jit(register_given_overlap, static_argnames="solves")
+    answer = solve(params, whole(SOURCE), whole(TARGET), *MASKS, solves=iterations)
     assert answer.valid
     last, composed, soft = registered(released, iterations)
     found = oracle.homogeneous(answer.rotation, answer.translation)
@@ -118,7 +119,7 @@ def test_the_frozen_overlap_network_gets_no_key_for_dropout(tmp_path, monkeypatc
         keys["overlap"] = key
         return jnp.ones(N), jnp.ones(N), None
 
-    def registered(params, source, target, source_overlap, target_overlap, key=None):
+    def registered(params, source, target, source_overlap, target_overlap, key=None, solves=None):
         keys["registration"] = key
         raise Asked  # what follows is of no interest here
 

@@ -83,7 +83,6 @@ LIMITED = dataclasses.replace(
     overlap_passes=2,
     overlap_points=40,
     registration_points=24,
-    iterations=2,
 )
 
 
@@ -111,12 +110,11 @@ def test_padding_does_not_matter(params, answer, size, garbage):
 
 
 def test_several_passes_are_both_networks_in_turn(x64):
-    config = dataclasses.replace(LIMITED, iterations=1)
-    params = small_params(5, config)
+    params = small_params(5, LIMITED)
     source, target = (Cloud(jnp.asarray(x), jnp.asarray(len(x))) for x in (SOURCE, TARGET))
     motion = Rigid(jnp.eye(3), jnp.asarray(TARGET.mean(0) - SOURCE.mean(0)))
     predict, solve = jax.jit(predict_overlap_and_matches), jax.jit(register_given_overlap)
-    for _ in range(config.overlap_passes):
+    for _ in range(LIMITED.overlap_passes):
         *overlap, _ = predict(params, source, target, start=motion)
         moved = source._replace(points=rigid.apply(motion, source.points))
         step = solve(params, moved, target, *overlap)
