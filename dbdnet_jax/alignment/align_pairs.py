@@ -91,6 +91,20 @@ def _results(found: Iterator[tuple[int, Any]]) -> Iterator[PairResult]:
         yield PairResult(number, None if failed else answer, answer if failed else None)
 
 
+def load_once(name: str) -> Params:
+    """Weights as `load_named` has them, read anew only where their file has changed."""
+    path = Path(name).absolute() if name.endswith(".npz") else None
+    if path is None or not path.exists():
+        return _load_stamped(name, None)
+    status = path.stat()
+    return _load_stamped(str(path), (status.st_mtime_ns, status.st_size, status.st_ino))
+
+
+@functools.lru_cache(maxsize=2)
+def _load_stamped(name: str, _: tuple[int, ...] | None) -> Params:
+    return load_named(name)
+
+
 def _prepare(weights: Params | str) -> None:
     """What a process of our own needs once."""
     keep_compiled_programs()
@@ -105,8 +119,5 @@ def _align(weights: Params | str, options: dict[str, Any], pair: tuple[Any, Any]
 
 
 def _load(weights: Params | str) -> Params:
-    """Weights that are loaded once in a process."""
-    return weights if isinstance(weights, Params) else _load_named(weights)
-
-
-_load_named = functools.cache(load_named)
+    """The network that is given, or the one that is named."""
+    return load_once(weights) if isinstance(weights, str) else weights

@@ -35,7 +35,7 @@ def default_jobs() -> int:
 
 def run_through(
     executor: Executor, work: Callable[[Any], Any], items: Iterable[Any], in_flight: int
-) -> Iterator[tuple[int, Any]]:
+) -> Generator[tuple[int, Any], None, None]:
     """The number of each item, and what ``work`` makes of it or a `Failure`, as they come.
 
     Only ``executor.submit`` and its futures' ``add_done_callback``, ``result`` and ``cancel`` are
@@ -75,7 +75,7 @@ def run_in_processes(
     items: Iterable[Any],
     jobs: int,
     prepare: Callable[[], Any],
-) -> Iterator[tuple[int, Any]]:
+) -> Generator[tuple[int, Any], None, None]:
     """The same in ``jobs`` spawned processes of our own, each with one item at a time.
 
     Each calls ``prepare`` once, and keeps to its share of the cores. Where a process dies, another

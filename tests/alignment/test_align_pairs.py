@@ -9,7 +9,7 @@ from dbdnet_jax.alignment.align_pairs import align_pairs
 from dbdnet_jax.alignment.writing import write_ply
 from tests.aligning import POINTS, pair, rotation_error_deg, tiny_params
 
-OPTIONS = {"max_points": POINTS, "search": "near"}
+OPTIONS = {"max_points": POINTS, "search": "near", "refine": False}
 
 
 def check(results, truth) -> None:
@@ -36,7 +36,8 @@ def clouds(tmp_path):
     return pairs, truth
 
 
-def test_processes_of_our_own_align(clouds, tmp_path):
+def test_processes_of_our_own_align(clouds, tmp_path, monkeypatch):
+    monkeypatch.setenv("JAX_NUM_CPU_DEVICES", "2")  # as here, so that they share kept programs
     pairs, truth = clouds
     dbdnet_jax.save_params(tmp_path / "tiny.npz", tiny_params())
     options = {**OPTIONS, "initial": truth}
