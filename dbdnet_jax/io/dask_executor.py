@@ -7,6 +7,7 @@ from concurrent.futures import Executor
 from dbdnet_jax.errors import MissingExtraError
 
 LEAST_ROOM = 32  # for workers that come later
+CONNECT_S = 10
 
 
 @contextlib.contextmanager
@@ -24,6 +25,13 @@ def open_dask(address: str) -> Iterator[tuple[Executor, int]]:
             f"an executor dask:// needs dask.distributed; importing it failed ({error}). Install "
             'it with `pip install "dbdnet_jax[dask]"`.'
         ) from error
-    with Client(f"tcp://{address}", set_as_default=False) as client:
+    try:
+        client = Client(f"tcp://{address}", timeout=CONNECT_S, set_as_default=False)
+    except OSError as error:
+        raise OSError(
+            f"dask://{address} must be a Dask scheduler that answers within {CONNECT_S} s; "
+            f"{error}. Start one with `dask scheduler`."
+        ) from error
+    with client:
         threads = sum(client.nthreads().values())
         yield client.get_executor(pure=False), max(2 * threads, LEAST_ROOM)

@@ -15,6 +15,7 @@ from dbdnet_jax.cli.statuses import ALIGNED, FAILED, UNREAD, UNSURE, UNUSABLE
 from dbdnet_jax.io.workers import run_through
 from tests.cli.conftest import HTML, PNG, needs_report
 from tests.cli.stand_ins import prepare_nothing, stand_in
+from tests.dask_cluster import cluster
 
 ALIGN = importlib.import_module("dbdnet_jax.alignment.align")  # not the function
 
@@ -190,3 +191,22 @@ def test_options_of_a_batch_are_not_for_a_pair(capsys):
     with pytest.raises(SystemExit):
         main(["a.ply", "b.ply", "--jobs", "2"])
     assert "--jobs is for --batch" in capsys.readouterr().err
+
+
+def test_a_dask_cluster_aligns_and_the_files_are_written_here(batch, tmp_path, monkeypatch):
+    pytest.importorskip("distributed", reason="the dask extra is not installed")
+    monkeypatch.setattr("dbdnet_jax.cli.batch._align_elsewhere", stand_in)
+    (tmp_path / "dask").mkdir()
+    with cluster(tmp_path / "dask") as (address, workers):
+        status, out, _ = batch("a1 b2 a3 a4", "--json", "--executor", f"dask://{address}")
+    assert status == UNUSABLE
+    records = {record["source"]: record for record in map(json.loads, out.splitlines())}
+    assert out.count("\n") == len(records) == 4 and records["b2"]["failure"] == "input"
+    assert {records[x]["process"] for x in ("a1", "a3", "a4")} <= {x.pid for x in workers}
+    assert len(os.listdir("out")) == 3
+
+
+def test_no_scheduler_is_an_error_in_words(batch):
+    pytest.importorskip("distributed", reason="the dask extra is not installed")
+    status, _, err = batch("a1", "--executor", "dask://127.0.0.1:1")
+    assert status == UNUSABLE and "dask://127.0.0.1:1 must be a Dask scheduler" in err
