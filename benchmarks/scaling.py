@@ -5,10 +5,10 @@
     python -m benchmarks.scaling --part=dask --count=1000
 
 ``pairs`` aligns noisy test pairs of CAD shapes with `align_pairs`, every tenth damaged, on one
-process and on more: seconds from the first answer to the last, so that starting counts for none, and
-with the start. ``memory`` aligns in this process and gives its resident memory at 100 alignments and
-at the end. ``dask`` aligns on two workers of Dask, of which one is killed half-way. Each fails if a
-pair has no answer, or two, or if one that is not damaged fails.
+process and on more: seconds with the start, and from the first answer to the last, so that starting
+counts for none. ``memory`` aligns in this process and gives its resident memory at 100 alignments
+and at the end. ``dask`` aligns on two workers of Dask, of which one is killed half-way. Each fails
+if a pair has no answer, or two, or if one that is not damaged fails.
 """
 
 import argparse

@@ -44,7 +44,7 @@ def align_pairs(
             print(number, failure.message if failure else alignment.transform)
 
     Without an executor it starts processes of its own, which load weights and programs once each
-    and keep to their share of the cores. They import the script that starts them, so its own work
+    and work on one core each. They import the script that starts them, so its own work
     must stand below ``if __name__ == "__main__":``. A process that dies (a crash, a kill, memory)
     is replaced, and its pair tried once more, alone, at the end. They end when the iterator is
     closed or this process ends.

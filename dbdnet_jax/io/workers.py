@@ -28,9 +28,7 @@ def default_jobs() -> int:
 
     Processes that share an accelerator would take its memory from one another.
     """
-    platforms = os.environ.get("JAX_PLATFORMS", "").split(",")
-    plugins = entry_points(group="jax_plugins") or importlib.util.find_spec("libtpu")
-    return 1 if plugins and platforms != ["cpu"] else len(_cores())
+    return 1 if _may_accelerate() else len(_cores())
 
 
 def run_through(
@@ -78,7 +76,7 @@ def run_in_processes(
 ) -> Generator[tuple[int, Any], None, None]:
     """The same in ``jobs`` spawned processes of our own, each with one item at a time.
 
-    Each calls ``prepare`` once, and keeps to its share of the cores. Where a process dies, another
+    Each calls ``prepare`` once, and works on one core. Where a process dies, another
     takes its place; the item in it is tried again at the end, alone, since memory may have been
     short, and is a `Failure` if that process dies too. All processes are killed when the iterator
     is closed, and end when this process does.
@@ -181,6 +179,13 @@ def _kill(pool: ProcessPoolExecutor) -> None:
         process.kill()
 
 
+def _may_accelerate() -> bool:
+    """Whether JAX could find more than the CPU; asking JAX itself would start it."""
+    platforms = os.environ.get("JAX_PLATFORMS", "").split(",")
+    plugins = entry_points(group="jax_plugins") or importlib.util.find_spec("libtpu")
+    return bool(plugins) and platforms != ["cpu"]
+
+
 def _cores() -> list[int]:
     """The cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
@@ -189,11 +194,14 @@ def _cores() -> list[int]:
 
 
 def _prepare(place: int, jobs: int, work: Callable[[Any], Any], prepare: Callable[[], Any]) -> None:
-    """In a new process: take a share of the cores, end with the parent, get ready."""
+    """In a new process: keep to one core, end with the parent, get ready."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    cores = _cores()
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, cores[place::jobs] or [cores[place % len(cores)]])
+    if not _may_accelerate():
+        # XLA's threads on the CPU: a pair gains nothing from a second one.
+        os.environ.setdefault("NPROC", "1")
+        cores = _cores()
+        if jobs >= len(cores) and hasattr(os, "sched_setaffinity"):  # else others may want them
+            os.sched_setaffinity(0, [cores[place % len(cores)]])
     _HELD["work"] = work
     prepare()
 
