@@ -105,7 +105,6 @@ def by_dask(count: int) -> dict[str, Any]:
         LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
         Client(cluster) as client,
     ):
-        client.run(keep_compiled_programs)
         processes = list(client.run(os.getpid).values())
         executor = client.get_executor(pure=False)
         results = align_pairs(some_pairs(count, True), executor=executor, in_flight=8)

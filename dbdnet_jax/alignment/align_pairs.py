@@ -2,6 +2,7 @@
 
 import functools
 import inspect
+import os
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Executor
 from pathlib import Path
@@ -75,11 +76,12 @@ def align_pairs(
     if executor is not None and jobs is not None:
         raise ValueError("jobs must not be given with an executor; it has workers of its own.")
     weights = params if isinstance(params, Params) else str(params or "cad")
-    work = functools.partial(_align, weights, options)
     if executor is None:
         prepare = functools.partial(_prepare, weights)
+        work = functools.partial(_align, weights, options)
         found = run_in_processes(work, pairs, jobs or default_jobs(), prepare)
     else:
+        work = functools.partial(_align_there, os.getpid(), weights, options)
         found = run_through(executor, work, pairs, in_flight or IN_FLIGHT * default_jobs())
     return _results(found)
 
@@ -116,6 +118,18 @@ def _align(weights: Params | str, options: dict[str, Any], pair: tuple[Any, Any]
     """One pair, in whatever process this is."""
     source, target = pair
     return align(source, target, _load(weights), **options)
+
+
+def _align_there(
+    home: int, weights: Params | str, options: dict[str, Any], pair: tuple[Any, Any]
+) -> Alignment:
+    """One pair in an executor; where that is a process but ``home``, programs are kept in it."""
+    if os.getpid() != home:
+        _keep_once()
+    return _align(weights, options, pair)
+
+
+_keep_once = functools.cache(keep_compiled_programs)
 
 
 def _load(weights: Params | str) -> Params:
