@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from dbdnet_jax.alignment.align import Alignment, align
 from dbdnet_jax.errors import Failure
 from dbdnet_jax.io.programs import keep_compiled_programs, require_device
-from dbdnet_jax.io.workers import default_jobs, run_in_processes, run_through
+from dbdnet_jax.io.workers import available_cores, default_jobs, run_in_processes, run_through
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import load_named
 
@@ -82,7 +82,7 @@ def align_pairs(
         found = run_in_processes(work, pairs, jobs or default_jobs(), prepare)
     else:
         work = functools.partial(_align_there, os.getpid(), weights, options)
-        found = run_through(executor, work, pairs, in_flight or IN_FLIGHT * default_jobs())
+        found = run_through(executor, work, pairs, in_flight or IN_FLIGHT * len(available_cores()))
     return _results(found)
 
 

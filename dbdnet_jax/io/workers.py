@@ -23,12 +23,19 @@ class Worker(NamedTuple):
     prepared: Future
 
 
+def available_cores() -> list[int]:
+    """The cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return sorted(os.sched_getaffinity(0))
+    return list(range(os.cpu_count() or 1))
+
+
 def default_jobs() -> int:
     """One for each core that this process may use; one where JAX may find an accelerator.
 
     Processes that share an accelerator would take its memory from one another.
     """
-    return 1 if _may_accelerate() else len(_cores())
+    return 1 if _may_accelerate() else len(available_cores())
 
 
 def run_through(
@@ -186,20 +193,13 @@ def _may_accelerate() -> bool:
     return bool(plugins) and platforms != ["cpu"]
 
 
-def _cores() -> list[int]:
-    """The cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return sorted(os.sched_getaffinity(0))
-    return list(range(os.cpu_count() or 1))
-
-
 def _prepare(place: int, jobs: int, work: Callable[[Any], Any], prepare: Callable[[], Any]) -> None:
     """In a new process: keep to one core, end with the parent, get ready."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     if not _may_accelerate():
         # XLA's threads on the CPU: a pair gains nothing from a second one.
         os.environ.setdefault("NPROC", "1")
-        cores = _cores()
+        cores = available_cores()
         if jobs >= len(cores) and hasattr(os, "sched_setaffinity"):  # else others may want them
             os.sched_setaffinity(0, [cores[place % len(cores)]])
     _HELD["work"] = work
