@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from dbdnet_jax.alignment.align import Alignment, align
     from dbdnet_jax.alignment.align_many import MultiAlignment, align_many
+    from dbdnet_jax.alignment.align_pairs import PairResult, align_pairs
     from dbdnet_jax.networks.dbdnet.register import register
     from dbdnet_jax.networks.dbdnet.released import from_released, to_released
     from dbdnet_jax.networks.weights import load_params, load_pretrained, save_params
@@ -19,9 +20,11 @@ __version__ = "0.1.0"
 __all__ = [
     "Alignment",
     "MultiAlignment",
+    "PairResult",
     "Registration",
     "align",
     "align_many",
+    "align_pairs",
     "from_released",
     "load_params",
     "load_pretrained",
@@ -32,9 +35,11 @@ __all__ = [
 _MODULES = {
     "Alignment": "alignment.align",
     "MultiAlignment": "alignment.align_many",
+    "PairResult": "alignment.align_pairs",
     "Registration": "types",
     "align": "alignment.align",
     "align_many": "alignment.align_many",
+    "align_pairs": "alignment.align_pairs",
     "from_released": "networks.dbdnet.released",
     "load_params": "networks.weights",
     "load_pretrained": "networks.weights",

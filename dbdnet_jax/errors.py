@@ -1,7 +1,10 @@
-"""Files that cannot be read, and libraries that only an extra of the package brings."""
+"""Errors with a meaning of their own, what loads an extra, and errors as records."""
 
 import importlib.util
+import re
+import traceback
 from types import ModuleType
+from typing import Literal, NamedTuple
 
 
 class CheckpointError(ValueError):
@@ -10,6 +13,30 @@ class CheckpointError(ValueError):
 
 class MissingExtraError(ImportError):
     """A library is not installed; the text says which, and what to install."""
+
+
+class Failure(NamedTuple):
+    """Why there is no answer: an error as a record, which any process can pass to any other.
+
+    ``kind`` is "input" (unusable, and ``message`` says why), "memory", "crash" (the process died)
+    or "unexpected"; ``where`` is the traceback, if there was one.
+    """
+
+    kind: Literal["input", "memory", "crash", "unexpected"]
+    message: str
+    where: str = ""
+
+
+def failure_of(error: BaseException) -> Failure:
+    """An error as a record, its message a sentence."""
+    what, where = str(error), "".join(traceback.format_exception(error))
+    if isinstance(error, MemoryError) or re.search("RESOURCE_EXHAUSTED|[Oo]ut of memory", what):
+        what = f"out of memory: {what.splitlines()[0] if what else 'no details'}"
+        return Failure("memory", f"{what}. Give fewer points, or stop other programs.", where)
+    if isinstance(error, ValueError | OSError | ImportError):
+        return Failure("input", what, where)
+    what = " ".join(what.split())[:1000]
+    return Failure("unexpected", f"unexpected {type(error).__name__}: {what}.", where)
 
 
 def load_open3d(needed_by: str) -> ModuleType:

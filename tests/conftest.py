@@ -70,7 +70,7 @@ classical/test_refine.py networks/test_weights.py networks/dbdnet/test_released.
 data/test_surface.py data/test_modelnet40.py training/test_optimizer.py training/test_stages.py
 alignment/test_candidates.py alignment/test_quality.py alignment/test_surfaces.py
 alignment/test_voxels.py evaluation/test_tables.py drawing/test_evaluation_page.py
-test_structure.py test_guards.py
+cli/test_arguments.py test_structure.py test_guards.py
 """.split()
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from dbdnet_jax.cli import _parser
+from dbdnet_jax.cli.arguments import make_parser
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -64,7 +64,7 @@ def wrong_words(command: str) -> list[str]:
         known = flags_of(script)
         problems += [] if script.is_file() else [match[0]]
     elif match := re.match("dbdnet-register", command):
-        actions = _parser()._actions
+        actions = make_parser()._actions
         known = {option.lstrip("-") for action in actions for option in action.option_strings}
     else:
         return problems  # of another project

@@ -12,8 +12,8 @@ from dbdnet_jax.alignment.align import Alignment
 from dbdnet_jax.io.files import write_atomic
 
 
-def write_transform(path: Path, alignment: Alignment) -> None:
-    """The 4x4 matrix as text or ``.npy``, or everything but the long arrays as ``.json``."""
+def transform_file(path: Path, alignment: Alignment) -> bytes:
+    """What a file of that name holds: the 4x4 matrix as text or ``.npy``, or `as_json`."""
     buffer = io.BytesIO()
     if path.suffix.lower() == ".json":
         buffer.write((json.dumps(as_json(alignment), indent=2) + "\n").encode())
@@ -21,14 +21,19 @@ def write_transform(path: Path, alignment: Alignment) -> None:
         np.save(buffer, alignment.transform)
     else:
         np.savetxt(buffer, alignment.transform, fmt="%.17g")
-    write_atomic(path, buffer.getvalue())
+    return buffer.getvalue()
 
 
-def write_ply(path: Path, points: Float[np.ndarray, "n 3"]) -> None:
+def ply_file(points: Float[np.ndarray, "n 3"]) -> bytes:
     """Points as a binary PLY in float64."""
     axes = "".join(f"property double {axis}\n" for axis in "xyz")
     head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(points)}\n{axes}end_header\n"
-    write_atomic(path, head.encode() + np.ascontiguousarray(points, "<f8").tobytes())
+    return head.encode() + np.ascontiguousarray(points, "<f8").tobytes()
+
+
+def write_ply(path: Path, points: Float[np.ndarray, "n 3"]) -> None:
+    """Write `ply_file`, whole or not at all."""
+    write_atomic(path, ply_file(points))
 
 
 def as_json(alignment: Alignment) -> dict[str, Any]:

@@ -220,11 +220,28 @@ def test_three_scans_of_a_shape_find_together(monkeypatch):
 CLOUDS = [random_cloud(i, 30) for i in range(3)]
 
 
+def test_neighbours_in_the_order_of_scans_are_few_pairs_with_loops(monkeypatch):
+    asked = []
+
+    def align(source, target, *_, **__):
+        asked.append((len(source), len(target)))
+        return aligned(np.eye(4))
+
+    monkeypatch.setattr(module, "align", align)
+    clouds = [random_cloud(i, 30 + i) for i in range(40)]
+    found = align_many(clouds, tiny_params(), neighbours=4, pairs=[(39, 0), (1, 0)])
+    assert found.connected.all()
+    gaps = [target - source for source, target in asked]
+    assert sorted(gaps) == sorted([-39, -1] + [1] * 38 + [2] * 38 + [3] * 37 + [4] * 36)
+    assert len(set(map(frozenset, asked))) == len(asked) == 151
+
+
 @pytest.mark.parametrize(
     ("clouds", "options", "words"),
     [
         (CLOUDS[:1], {}, "at least two; got 1"),
         (CLOUDS * 5, {}, "pairs must be given for more than 12 clouds; got 15, which have 105"),
+        (CLOUDS, {"neighbours": 0}, "neighbours must be at least 1; got 0"),
         (CLOUDS, {"pairs": [(0, 3)]}, r"of two clouds in 0\.\.2; got \(0, 3\)"),
         (CLOUDS, {"pairs": [(1, 1)]}, r"got \(1, 1\)"),
         (CLOUDS, {"pairs": [(0, 1), (0, 1)]}, "pairs must be different"),

@@ -13,7 +13,8 @@ import pytest
 from dbdnet_jax import save_params
 from dbdnet_jax.alignment.search import predict_pose
 from dbdnet_jax.alignment.writing import write_ply
-from dbdnet_jax.cli import UNUSABLE, main
+from dbdnet_jax.cli import main
+from dbdnet_jax.cli.statuses import UNUSABLE
 from tests.aligning import POINTS, pair, rotation_error_deg, solid, tiny_align, tiny_params
 from tests.conftest import random_cloud
 

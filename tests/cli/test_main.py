@@ -6,52 +6,19 @@ import os
 import subprocess
 import sys
 import warnings
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from dbdnet_jax import save_params
-from dbdnet_jax.alignment.writing import write_ply
-from dbdnet_jax.cli import ALIGNED, FAILED, UNREAD, UNSURE, UNUSABLE, main
+from dbdnet_jax.cli.statuses import ALIGNED, FAILED, UNREAD, UNSURE, UNUSABLE
 from dbdnet_jax.io.point_files import read_points
 from dbdnet_jax.io.transform_files import read_transform
-from tests.aligning import POINTS, pair, rotation_error_deg, tiny_align, tiny_params
+from tests.aligning import pair, rotation_error_deg, tiny_align
+from tests.cli.conftest import HTML, PNG, needs_report
 
 ALIGN = importlib.import_module("dbdnet_jax.alignment.align")  # not the function
-EXAMPLES = Path(__file__).parents[1] / "examples"
-needs_report = pytest.mark.skipif(
-    not (find_spec("plotly") and find_spec("matplotlib")),
-    reason="the report extra is not installed",
-)
-PNG, HTML = b"\x89PNG\r\n", b"<!DOCTYPE html>"
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory) -> Path:
-    """Weights, a guess, and two clouds that it fits."""
-    folder = tmp_path_factory.mktemp("cli")
-    source, target, transform = pair()
-    write_ply(folder / "a.ply", source)
-    write_ply(folder / "b.ply", target)
-    np.savetxt(folder / "guess.txt", transform)
-    save_params(folder / "tiny.npz", tiny_params())
-    return folder
-
-
-@pytest.fixture
-def run(folder, capsys, monkeypatch):
-    """Run the command in the folder; returns status, stdout and stderr."""
-    monkeypatch.chdir(folder)
-
-    def run(*arguments, batch=False):
-        fixed = ["--params", "tiny.npz", "--max-points", str(POINTS)]
-        fixed += [] if batch else ["--initial", "guess.txt"]
-        status = main([*map(str, arguments), *fixed])
-        return status, *capsys.readouterr()
-
-    return run
+EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 def likely(monkeypatch, probability: float) -> None:
@@ -114,52 +81,6 @@ def test_no_refinement_is_asked_for(run, monkeypatch):
     with pytest.raises(pytest.fail.Exception, match="judged"):
         run("a.ply", "b.ply", "--no-refine")
     assert not refined
-
-
-def test_a_list_of_pairs_writes_a_transform_each_and_goes_on_after_a_bad_one(run, tmp_path):
-    (tmp_path / "pairs.txt").write_text(
-        f"# source target\n{Path.cwd()}/a.ply {Path.cwd()}/b.ply\n\nmissing.ply 'b b.ply'\n"
-    )
-    status, out, err = run("--batch", tmp_path / "pairs.txt", "-o", tmp_path, "--json", batch=True)
-    assert status == UNUSABLE
-    assert f"error: {tmp_path}/pairs.txt:4: a point file must exist" in err
-    assert out.count("\n") == 1
-    assert {path.name for path in tmp_path.iterdir()} == {"pairs.txt", "0002_a_b.txt"}
-
-
-def test_a_folder_of_pairs_goes_by_names(run, folder, tmp_path):
-    for name in ("one", "two"):
-        os.link(folder / "a.ply", tmp_path / f"{name}_source.ply")
-        os.link(folder / "b.ply", tmp_path / f"{name}_target.ply")
-    (tmp_path / "out").mkdir()
-    status, out, _ = run("--batch", tmp_path, "-o", tmp_path / "out", batch=True)
-    assert status in (ALIGNED, UNSURE)
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["one.txt", "two.txt"]
-
-
-@pytest.mark.parametrize(
-    ("error", "message"),
-    [
-        (MemoryError("Unable to allocate 9 GiB"), "out of memory: Unable to allocate 9 GiB"),
-        (RuntimeError("RESOURCE_EXHAUSTED: no room\nmore"), "out of memory: RESOURCE_EXHAUSTED"),
-        (TypeError("a bug\x1b[2J"), r"unexpected TypeError: a bug\x1b[2J. DBDNET_DEBUG=1 shows"),
-        (RecursionError("too deep"), "unexpected RecursionError: too deep"),
-    ],
-)
-def test_an_unexpected_error_costs_its_pair_alone(run, tmp_path, monkeypatch, error, message):
-    align, calls = ALIGN.align, []
-
-    def fail_once(*args, **options):
-        calls.append(1)
-        if len(calls) == 1:
-            raise error
-        return align(*args, **options)
-
-    monkeypatch.setattr(ALIGN, "align", fail_once)
-    (tmp_path / "pairs.txt").write_text(f"{Path.cwd()}/a.ply {Path.cwd()}/b.ply\n" * 2)
-    status, out, err = run("--batch", tmp_path / "pairs.txt", "-o", tmp_path, batch=True)
-    assert status == FAILED and message in err and "Traceback" not in err
-    assert out.count("T =") == 1 and (tmp_path / "0002_a_b.txt").exists()
 
 
 def test_a_traceback_is_shown_to_who_asks_for_it(run, monkeypatch):
@@ -258,14 +179,6 @@ def test_a_page_and_a_picture_are_written(run, tmp_path):
     assert page.startswith(HTML) and b"dbdnet-register a.ply b.ply --report" in page
     assert (tmp_path / "r.png").read_bytes().startswith(PNG)
     assert len(list(tmp_path.iterdir())) == 2
-
-
-@needs_report
-def test_a_batch_writes_its_pages_and_pictures_into_folders(run, folder, tmp_path):
-    (tmp_path / "pairs.txt").write_text(f"{folder}/a.ply {folder}/b.ply\n")
-    run("--batch", tmp_path / "pairs.txt", "--report", tmp_path, "--png", tmp_path, batch=True)
-    assert (tmp_path / "0001_a_b.html").read_bytes().startswith(HTML)
-    assert (tmp_path / "0001_a_b.png").read_bytes().startswith(PNG)
 
 
 @needs_report

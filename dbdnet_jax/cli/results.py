@@ -1,0 +1,72 @@
+"""A file of results, a line of JSON for each pair, from which a batch goes on."""
+
+import json
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from dbdnet_jax.cli.answers import as_line
+from dbdnet_jax.cli.jobs import Job
+
+
+class Results(NamedTuple):
+    """A file to append to, the options that its answers have, and which pairs have one."""
+
+    path: Path
+    options: dict[str, Any]
+    valid: dict[tuple[str, str, str], bool]
+
+
+def open_results(path: Path, options: dict[str, Any]) -> Results:
+    """A new file of results, or what stands in the one that is there.
+
+    A last line that was cut short is dropped: its pair is not done.
+
+    Raises:
+      ValueError: it is no file of results, or one of other options.
+      OSError: it cannot be read or written.
+    """
+    options = json.loads(json.dumps(options))
+    valid = {}
+    with path.open("ab+") as file:
+        file.seek(0)
+        lines = file.read().splitlines(keepends=True)
+        if lines and not lines[-1].endswith(b"\n"):
+            cut = lines.pop()
+            if lines or cut.startswith(b"{"):
+                file.truncate(sum(map(len, lines)))
+            else:
+                lines.append(cut)
+    for number, line in enumerate(lines, 1):
+        try:
+            record = json.loads(line)
+            held = record["options"]
+            key = record["pair"], record["source"], record["target"]
+        except (ValueError, TypeError, KeyError) as error:
+            raise ValueError(
+                f"results must be lines of JSON that an earlier run wrote; {path}:{number} is "
+                f"{line[:60]!r}. Name another file."
+            ) from error
+        if held != options:
+            other = next(x for x in options if held.get(x) != options[x])
+            raise ValueError(
+                f"all results of a file must have the same options; those in {path} have "
+                f"{other} {held.get(other)!r}, not {options[other]!r}. Name another file."
+            )
+        if "failure" not in record:
+            valid[key] = record["valid"]
+    return Results(path, options, valid)
+
+
+def find_done(results: Results, job: Job) -> bool | None:
+    """Whether the answer of a pair is valid; None where there is none, or not all of its files."""
+    key = job.pair.name, str(job.pair.source), str(job.pair.target)
+    return results.valid.get(key) if all(path.exists() for path in job.outputs) else None
+
+
+def append(results: Results, record: dict[str, Any]) -> None:
+    """Write a record as a line that stays, whatever happens afterwards."""
+    with results.path.open("a") as file:
+        file.write(as_line(record | {"options": results.options}) + "\n")
+        file.flush()
+        os.fsync(file.fileno())
