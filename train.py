@@ -28,6 +28,7 @@ from dbdnet_jax.networks.table import LEARNED
 from dbdnet_jax.networks.weights import save_params
 from dbdnet_jax.training.config import parse_flags, read_config
 from dbdnet_jax.training.loop import fit
+from dbdnet_jax.training.parallel import join_processes
 from dbdnet_jax.training.preemption import Preempted, interrupt_on_signals
 from dbdnet_jax.training.run_folder import JOINT, load_best
 from dbdnet_jax.training.table import STAGES
@@ -37,6 +38,12 @@ RUN_DIR = flags.DEFINE_string("run_dir", None, "Where results go; runs/NAME if n
 STAGE = flags.DEFINE_string(
     "stage", "all", "What to train: a stage of the method, or all (or both) but joint."
 )
+DISTRIBUTED = flags.DEFINE_bool(
+    "distributed", False, "One of several processes that train together; see docs/scaling.md."
+)
+COORDINATOR = flags.DEFINE_string("coordinator", None, "HOST:PORT of process 0 of several.")
+PROCESSES = flags.DEFINE_integer("processes", None, "How many train together.", lower_bound=1)
+PROCESS_ID = flags.DEFINE_integer("process_id", None, "Which of them this is, from 0.")
 EVALUATE = flags.DEFINE_bool("evaluate", True, "Print the table of results at the end.")
 
 
@@ -78,8 +85,10 @@ def train(run_dir: Path) -> None:
     # Before anything asks JAX for a device: the number is fixed from then on. More devices
     # than pairs in a step would have nothing to do.
     pairs = max(stage.batch_size for stage in config.stages.values())
-    devices = config.train.devices or min(os.cpu_count() or 1, pairs)
+    devices = config.train.devices // (PROCESSES.value or 1) or min(os.cpu_count() or 1, pairs)
     jax.config.update("jax_num_cpu_devices", devices)
+    if DISTRIBUTED.value or COORDINATOR.value:
+        join_processes(COORDINATOR.value, PROCESSES.value, PROCESS_ID.value)
     keep_compiled_programs()
     require_device()
     for stage in stages:
@@ -92,9 +101,13 @@ def train(run_dir: Path) -> None:
         )
         fit(config, stage, run_dir, stream)
     params = load_best(run_dir)
+    if jax.process_index():
+        return  # the first process does the rest
     save_params(run_dir / "params.npz", params)
     print(f"The best weights are in {run_dir / 'params.npz'}.")
-    if EVALUATE.value and set(LEARNED[config.method].parts) <= params.networks.keys():
+    if jax.process_count() > 1:
+        print("Several processes make no table of results; evaluate.py does.")
+    elif EVALUATE.value and set(LEARNED[config.method].parts) <= params.networks.keys():
         evaluation = evaluate(
             [Weights("params", params)],
             load_test_pairs(config.data, config.protocol, run_dir),

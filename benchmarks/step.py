@@ -73,12 +73,13 @@ def training_step(
     step = functools.partial(
         train_step,
         draw=stream.draw,
-        loss=jax.checkpoint(task.loss) if train.remat else task.loss,
+        loss=task.loss,
         optimizer=optimizer,
         batch_size=part.batch_size,
         mesh=mesh,
         ema_decay=train.ema_decay,
         accumulate=train.accumulate,
+        remat=train.remat,
     )
     state = on_all_devices(mesh, init_state(task.trainable, optimizer, ema_decay=train.ema_decay))
     # All four, so that the program may be called with what it was compiled for.

@@ -13,7 +13,18 @@ from pathlib import Path
 MACHINE_ERRORS = {
     getattr(errno, name)
     for name in (
-        *("EMFILE", "ENFILE", "ENOMEM", "EACCES", "EPERM", "EROFS", "ENOSPC", "EDQUOT", "EIO"),
+        *(
+            "EMFILE",
+            "ENFILE",
+            "ENOMEM",
+            "EACCES",
+            "EPERM",
+            "EROFS",
+            "ENOSPC",
+            "EDQUOT",
+            "EFBIG",
+            "EIO",
+        ),
         *("ESTALE", "ETIMEDOUT", "EAGAIN", "EBUSY"),
     )
 }

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental import multihost_utils
 
 from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.io.files import machine_error
@@ -186,8 +187,11 @@ class Checkpoints:
 
 
 def _set_aside(damaged: dict[Path, str]) -> None:
-    """Rename damaged checkpoints, each with a warning: the steps are taken again, and saved."""
-    for path, reason in damaged.items():
+    """Rename damaged checkpoints, each with a warning: the steps are taken again, and saved.
+
+    Of several processes the first does it, and the others wait.
+    """
+    for path, reason in damaged.items() if jax.process_index() == 0 else ():
         count = sum(1 for _ in path.parent.glob(f"damaged-{path.name}*"))
         aside = path.with_name(f"damaged-{path.name}" + (f"-{count}" if count else ""))
         warnings.warn(
@@ -197,6 +201,7 @@ def _set_aside(damaged: dict[Path, str]) -> None:
             stacklevel=4,
         )
         path.rename(aside)
+    multihost_utils.sync_global_devices("damaged checkpoints are set aside")
 
 
 def _advice(damaged: dict[Path, str]) -> str:

@@ -6,6 +6,7 @@ with the same parameters, bit for bit on a CPU.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import math
@@ -93,7 +94,8 @@ def run_task(
     )
     mesh = training_mesh(batch_size, train.devices)
     _require_parts(task, batch_size // mesh.size, train.accumulate)
-    with sole_training(folder), Checkpoints(folder) as checkpoints:
+    alone = sole_training(folder) if jax.process_index() == 0 else contextlib.nullcontext()
+    with alone, Checkpoints(folder) as checkpoints:
         state = init_state(
             task.trainable, optimizer, ema_decay=train.ema_decay, batch_stats=task.batch_stats
         )
@@ -103,12 +105,13 @@ def run_task(
         step = functools.partial(
             train_step,
             draw=stream.draw,
-            loss=jax.checkpoint(task.loss) if train.remat else task.loss,
+            loss=task.loss,
             optimizer=optimizer,
             batch_size=batch_size,
             mesh=mesh,
             ema_decay=train.ema_decay,
             accumulate=train.accumulate,
+            remat=train.remat,
         )
         with RunLog(folder, start) as log:
             loop = _Loop(task, stream, train, checkpoints, log, schedule, batch_size, total, mesh)
@@ -155,7 +158,7 @@ class _Loop:
                 state, metrics = step(state, frozen, key, next(arrays))
                 waiting.append(metrics)
                 at_row = done % train.log_every == 0 or done == self.total
-                stopping = bool(stop.name)
+                stopping = stop.asked(done)
                 # One step late, so that the device always has the next one to work on. A bad step
                 # gives back the state it was given, so the one after it did too.
                 while len(waiting) > (0 if at_row or stopping else 1):
@@ -170,7 +173,7 @@ class _Loop:
                     elif done % train.checkpoint_every == 0:
                         self.checkpoints.save(done, state)
                 if stopping:
-                    self._stop(done, state, window, stop.name)
+                    self._stop(done, state, window, stopping)
             if stop.name:  # it came while the last of it was saved
                 self._stop(self.total, state, [], stop.name)
 
@@ -190,6 +193,7 @@ class _Loop:
         return tqdm(
             desc=self.checkpoints.folder.parent.name,
             total=self.total * self.batch_size,
+            disable=jax.process_index() > 0,
             initial=start * self.batch_size,
             unit="pair",
             # A log file gets a line now and then, not ten a second.

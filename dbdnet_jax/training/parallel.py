@@ -15,8 +15,29 @@ from jaxtyping import Array, Int
 AXIS = "pairs"
 
 
+def join_processes(
+    coordinator: str | None = None, processes: int | None = None, process_id: int | None = None
+) -> None:
+    """Make this one of several processes that train together, before JAX has made any device.
+
+    ``coordinator`` is the HOST:PORT of process 0. What is None is taken from the scheduler's
+    environment, as `jax.distributed.initialize` knows it: Slurm, Open MPI, a TPU pod.
+
+    Raises:
+        ValueError: the environment does not say, or the others cannot be reached.
+    """
+    try:
+        jax.distributed.initialize(coordinator, processes, process_id)
+    except (ValueError, RuntimeError) as error:
+        raise ValueError(
+            "processes that train together must know and reach each other; got --coordinator="
+            f"{coordinator}, --processes={processes}, --process_id={process_id} "
+            f"({str(error).splitlines()[0][:200]}). Give all three, or start them by a scheduler."
+        ) from error
+
+
 def training_mesh(batch_size: int, devices: int = 0) -> Mesh:
-    """The first ``devices`` of this machine, which share each batch equally; 0: all of them.
+    """The first ``devices``, as many of each process, which share each batch; 0: all there are.
 
     On a CPU, where XLA makes as many devices as it is told to, 0 is the most that the batch can be
     divided among.
@@ -24,14 +45,15 @@ def training_mesh(batch_size: int, devices: int = 0) -> Mesh:
     Raises:
         ValueError: there are fewer, or they cannot share the batch; says what would fit.
     """
-    there = jax.device_count()
-    if devices > there:
+    processes, there = jax.process_count(), jax.device_count()
+    if devices > there or devices % processes:
         raise ValueError(
-            f"config.train.devices must be at most the devices there are; got {devices} of {there}."
-            " Use 0 for all."
+            f"config.train.devices must be at most the {there} devices there are, and as many in "
+            f"each of the {processes} processes; got {devices}. Use 0 for all."
         )
     if not devices and jax.default_backend() == "cpu":
-        devices = max(n for n in range(1, there + 1) if batch_size % n == 0)
+        shares = range(processes, there + 1, processes)
+        devices = max((n for n in shares if batch_size % n == 0), default=there)
     size = devices or there
     if batch_size % size:
         below = batch_size - batch_size % size
@@ -41,12 +63,22 @@ def training_mesh(batch_size: int, devices: int = 0) -> Mesh:
             f"{batch_size}. Use a batch_size of {fitting} (any multiple of {size}), or "
             f"--config.train.devices={math.gcd(batch_size, size)}."
         )
-    return Mesh(np.asarray(jax.devices()[:size]), (AXIS,), axis_types=(AxisType.Auto,))
+    found = sorted(jax.devices(), key=lambda device: (device.process_index, device.id))
+    of_each = np.asarray(found).reshape(processes, -1)[:, : size // processes]
+    return Mesh(of_each.reshape(-1), (AXIS,), axis_types=(AxisType.Auto,))
 
 
 def on_all_devices(mesh: Mesh, tree: Any) -> Any:
     """A copy of ``tree`` on each device of the mesh; a step then compiles once."""
-    return jax.device_put(tree, NamedSharding(mesh, PartitionSpec()))
+    everywhere = NamedSharding(mesh, PartitionSpec())
+
+    def put(leaf: Any) -> Any:
+        # JAX moves no typed key to the devices of other processes, but the numbers in it.
+        if jax.process_count() > 1 and jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(put(jax.random.key_data(leaf)))
+        return jax.device_put(leaf, everywhere)
+
+    return jax.tree.map(put, tree)
 
 
 def mean_over_pairs(

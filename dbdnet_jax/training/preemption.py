@@ -9,6 +9,9 @@ import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
+import jax
+from jax.experimental import multihost_utils
+
 SIGNALS = (signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
 
 
@@ -25,10 +28,21 @@ class StopRequest:
         """Remember the signal; a second Ctrl-C does not wait for the next step."""
         again = self.name == signal.Signals.SIGINT.name
         self.name = signal.Signals(number).name
+        if jax.distributed.is_initialized():
+            os.kill(os.getpid(), signal.SIGTERM)  # JAX tells the other processes of that one
         if number == signal.SIGHUP:
             _leave_terminal()
         if again and number == signal.SIGINT:
             raise KeyboardInterrupt
+
+    def asked(self, step: int) -> str:
+        """The signal after which to stop at ``step``, or "".
+
+        With several processes it is the same step in all of them, soon after one got the signal.
+        """
+        if not jax.distributed.is_initialized():
+            return self.name
+        return "SIGTERM" if multihost_utils.reached_preemption_sync_point(step) else ""
 
 
 @contextlib.contextmanager
@@ -59,6 +73,8 @@ def _handled_by(handler: Callable[[int, FrameType | None], None]) -> Iterator[No
     try:
         if threading.current_thread() is threading.main_thread():  # others may set no handler
             for number in SIGNALS:
+                if jax.distributed.is_initialized() and number == signal.SIGTERM:
+                    continue  # JAX listens to it, see `StopRequest.asked`
                 if signal.getsignal(number) is not signal.SIG_IGN:
                     before[number] = signal.signal(number, handler)
         yield

@@ -6,6 +6,8 @@ import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
+import jax
+
 from dbdnet_jax.io.files import write_atomic
 
 KINDS = ("train", "validation")
@@ -16,12 +18,15 @@ class RunLog:
 
     Opened at the step a run goes on from, it drops the rows after it: those steps are done again,
     and the files end up as those of an unbroken run. Other files of the folder are left alone.
+    Of several processes only the first writes.
     """
 
     def __init__(self, folder: Path, start: int):
         from tensorboardX import SummaryWriter
 
-        self._folder = folder
+        self._folder, self._events = folder, None
+        if jax.process_index():
+            return
         for kind in KINDS:
             _truncate(folder / f"{kind}.csv", start)
         self._events = SummaryWriter(str(folder / "tensorboard"), purge_step=start + 1)
@@ -30,10 +35,13 @@ class RunLog:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._events.close()
+        if self._events:
+            self._events.close()
 
     def write(self, kind: str, step: int, values: Mapping[str, float]) -> None:
         """Append one row, written out at once; all rows of a kind have the same columns."""
+        if not self._events:
+            return
         path = self._folder / f"{kind}.csv"
         head = "" if path.exists() else ",".join(["step", *values]) + "\n"
         row = ",".join([str(step), *map(repr, values.values())]) + "\n"

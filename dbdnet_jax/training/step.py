@@ -77,15 +77,18 @@ def train_step(
     mesh: Mesh,
     ema_decay: float = 0.0,
     accumulate: int = 1,
+    remat: bool = False,
 ) -> tuple[TrainState, StepMetrics]:
     """One step on ``batch_size`` fresh pairs; pure, so its result depends on the arguments only.
 
     The devices of ``mesh`` share the pairs; on a GPU or TPU each takes its own in ``accumulate``
-    parts, one after another. ``loss`` is a task's (`training.task`). Where the loss, a term or the
-    gradient is not finite the state comes back as it was, step count included: the same step would
-    be taken again, and fail again, until the caller stops.
+    parts, one after another. ``remat`` recomputes the loss for its gradient. ``loss`` is a task's
+    (`training.task`). Where the loss, a term or the gradient is not finite the state comes back as
+    it was, step count included: the same step would be taken again, and fail again, until the
+    caller stops.
     """
     key = jax.random.fold_in(key, state.step)
+    loss = jax.checkpoint(loss) if remat else loss
     batch_stats = None
     if state.batch_stats is None:
         total, terms, gradient = _by_pair(

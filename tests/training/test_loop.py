@@ -1,6 +1,7 @@
 """The step and the loop: the same result however often a run is stopped, and no bad state kept."""
 
 import dataclasses
+import functools
 import signal
 from pathlib import Path
 
@@ -224,6 +225,31 @@ def test_a_bad_step_changes_nothing():
     state, new, metrics = step_once(4, ema_decay=0.5, bad=3 * 4 + 1)
     assert not metrics.finite and np.isnan(metrics.terms.fit) and np.isfinite(metrics.terms.size)
     jax.tree.map(lambda a, b: assert_close(a, b, EXACT), new, state)
+
+
+def test_recomputation_is_a_part_of_the_step_where_it_is_asked_for():
+    pairs, task, optimizer = stand_in.source(), stand_in.task(), optax.sgd(1.0)
+    state, mesh = init_state(task.trainable, optimizer), training_mesh(4)
+    options = {"draw": pairs.draw, "loss": task.loss, "optimizer": optimizer, "mesh": mesh}
+    rest = None, jax.random.key(0), next(pairs.arrays(0))
+
+    def text(remat):
+        step = functools.partial(train_step, batch_size=4, remat=remat, **options)
+        return str(jax.make_jaxpr(step)(state, *rest))
+
+    assert "remat" in text(True) or "checkpoint" in text(True)
+    assert "remat" not in text(False) and "checkpoint" not in text(False)
+
+
+def test_parts_that_cannot_be_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="must divide .* got 3 for 2. Use 1"):
+        stand_in.train(tmp_path, config=dataclasses.replace(stand_in.TRAIN, accumulate=3))
+    batch_norms = stand_in.task()._replace(batch_stats={"mean": jnp.zeros(3)})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stand_in, "task", lambda: batch_norms)
+        with pytest.raises(ValueError, match="must be 1 for a network with batch norms.*got 2"):
+            stand_in.train(tmp_path, config=dataclasses.replace(stand_in.TRAIN, accumulate=2))
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_average_has_a_short_memory_at_first():

@@ -1,8 +1,12 @@
 """How many devices share a batch changes its mean and a whole run by rounding only."""
 
 import os
+import re
+import signal
+import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import jax
@@ -10,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.interruptions import STAND_IN, rows
 from dbdnet_jax.training.parallel import mean_over_pairs, training_mesh
 from tests.conftest import EXACT, FLOAT32, assert_close
 
@@ -21,13 +26,13 @@ from pathlib import Path
 import jax
 jax.config.update("jax_num_cpu_devices", 8)
 from tests import stand_in
-train = dataclasses.replace(stand_in.TRAIN, **eval(sys.argv[3]))
+train = dataclasses.replace(stand_in.TRAIN, schedule="constant")
 stand_in.BATCH = 8
-for folder, devices, epochs in eval(sys.argv[2]):
+for folder, epochs, changes in eval(sys.argv[2]):
     stand_in.EPOCHS = epochs
     if sys.argv[1] != "cpu":
         jax.default_backend = lambda: sys.argv[1]
-    stand_in.train(Path(folder), config=dataclasses.replace(train, devices=devices))
+    stand_in.train(Path(folder), config=dataclasses.replace(train, **changes))
 """
 
 
@@ -80,11 +85,11 @@ def test_the_mesh_is_what_is_asked_for_or_an_error_that_says_what_fits(monkeypat
         training_mesh(1)  # seven of eight GPUs would idle
 
 
-def trained(backend: str, runs: list[tuple[Path, int, float]], **changes) -> None:
-    """Runs of the stand-in: folder, number of devices, epochs."""
-    runs = [(str(folder), devices, epochs) for folder, devices, epochs in runs]
+def trained(backend: str, runs: list[tuple[Path, float, dict]]) -> None:
+    """Runs of the stand-in: folder, epochs, changes of its configuration."""
+    runs = [(str(folder), epochs, changes) for folder, epochs, changes in runs]
     subprocess.run(
-        [sys.executable, "-c", RUN, backend, repr(runs), repr(changes)],
+        [sys.executable, "-c", RUN, backend, repr(runs)],
         cwd=ROOT,
         env={**os.environ, "JAX_PLATFORMS": "cpu"},
         check=True,
@@ -99,13 +104,47 @@ def curve(folder: Path, name: str = "train") -> np.ndarray:
 
 
 @pytest.mark.parametrize("backend", ["cpu", "gpu"])
-def test_one_two_and_eight_devices_give_the_same_curves_and_share_checkpoints(tmp_path, backend):
-    whole = [(tmp_path / str(devices), devices, 12.0) for devices in (1, 2, 8)]
-    moved = [
-        (tmp_path / "moved", devices, epochs) for devices, epochs in ((8, 4.0), (2, 8.0), (1, 12.0))
-    ]
-    trained(backend, [*whole, *moved], schedule="constant")
+def test_devices_parts_and_recomputation_change_rounding_only(tmp_path, backend):
+    """A run moved from 8 devices to 2 and to 1 too, each of which goes on from the checkpoints."""
+    runs = [(tmp_path / str(devices), 12.0, {"devices": devices}) for devices in (1, 2, 8)]
+    moves = ((8, 4.0), (2, 8.0), (1, 12.0))
+    runs += [(tmp_path / "moved", epochs, {"devices": devices}) for devices, epochs in moves]
+    runs += [(tmp_path / "parts", 12.0, {"devices": 2, "accumulate": 4, "remat": True})]
+    trained(backend, runs)
     for name in ("train", "validation"):
         expected = curve(tmp_path / "1", name)
-        for other in ("2", "8", "moved"):
+        for other in ("2", "8", "moved", "parts"):
             assert_close(curve(tmp_path / other, name), expected, FLOAT32)
+
+
+def free_port() -> int:
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return listener.getsockname()[1]
+
+
+def test_two_processes_train_as_one_stop_together_and_one_goes_on(tmp_path):
+    command = [*STAND_IN, "--config.overlap.batch_size=4", "--config.overlap.epochs=0.25"]
+    whole, shared = (f"--run_dir={tmp_path / name}" for name in ("whole", "shared"))
+    subprocess.run([*command, whole], cwd=ROOT, check=True, capture_output=True, timeout=300)
+    together = [*command, shared, f"--coordinator=127.0.0.1:{free_port()}"]
+    together += ["--config.train.devices=2"]
+    children = [
+        subprocess.Popen(
+            [*together, "--processes=2", f"--process_id={i}"], cwd=ROOT, stdout=subprocess.PIPE
+        )
+        for i in range(2)
+    ]
+    deadline = time.monotonic() + 300
+    while rows(tmp_path / "shared") < 5:
+        assert all(child.poll() is None for child in children) and time.monotonic() < deadline
+        time.sleep(0.01)
+    children[1].send_signal(signal.SIGTERM)  # not the one that writes
+    said = [child.communicate(timeout=120)[0].decode() for child in children]
+    assert [child.returncode for child in children] == [0, 0]
+    (step,) = {re.search("SIGTERM; the state after step ([0-9]+) of 40 ", text)[1] for text in said}
+    assert 5 <= int(step) < 40 and len(curve(tmp_path / "shared" / "overlap")) == int(step)
+    subprocess.run([*command, shared], cwd=ROOT, check=True, capture_output=True, timeout=300)
+    for name in ("train", "validation"):
+        found, expected = (curve(tmp_path / run / "overlap", name) for run in ("shared", "whole"))
+        assert_close(found, expected, FLOAT32)
