@@ -89,7 +89,7 @@ def differences(command: Sequence[str], folder: Path, kills: int, seed: int) -> 
     unbroken, stopped = folder / "unbroken", folder / "stopped"
     subprocess.run([*command, f"--run_dir={unbroken}"], check=True, capture_output=True)
     total, draw = rows(unbroken), random.Random(seed)
-    at_rows = sorted(draw.sample(range(1, total), kills))
+    at_rows = sorted(draw.choices(range(1, total), k=kills))
     for i, at_row in enumerate(at_rows):
         number = (signal.SIGKILL, signal.SIGTERM)[i % 2]
         delay_s = draw.uniform(0.0, 0.1) if i % 4 < 2 else 0.0

@@ -109,8 +109,10 @@ class Checkpoints:
                 custom_metadata={"crc32": _checksum(state), "window": list(window)},
                 force=True,
             )
-        except Exception as failure:
-            raise machine_error(failure, self.folder) or failure from failure
+        except Exception as failure:  # which kind depends on where Orbax was
+            if of_machine := machine_error(failure, self.folder):
+                raise of_machine from failure
+            raise
 
     def resume(self, like: State) -> Resumed | None:
         """The newest checkpoint that is whole, as `restore` gives it; None if there is none at all.
@@ -179,10 +181,13 @@ class Checkpoints:
         """Checkpoints whose metrics cannot be read, which would keep Orbax from reading any."""
         found = {}
         for path in self.folder.glob("*/metrics/metrics"):
+            checkpoint = path.parents[1]
+            if not checkpoint.name.isdigit():  # half written, or set aside
+                continue
             try:
                 float(json.loads(path.read_bytes())["error"])
             except (ValueError, KeyError, TypeError) as error:
-                found[path.parents[1]] = f"its metrics: {first_line(error)}"
+                found[checkpoint] = f"its metrics: {first_line(error)}"
         return found
 
 

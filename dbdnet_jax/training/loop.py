@@ -150,7 +150,7 @@ class _Loop:
         arrays = _on_all_devices(self.mesh, self.stream.arrays(start))
         validate = jax.jit(self._mean_validation)
         waiting: list[StepMetrics] = []
-        if self.task.networks and not start:
+        if self.task.networks and self.checkpoints.latest_step() is None:
             # They are trained already, and what follows may be worse.
             self._validate_and_save(0, state, validate, frozen, pairs)
         with stop_requests() as stop, self._bar(start) as bar:

@@ -137,6 +137,8 @@ def test_unreadable_metrics_cost_their_checkpoint_only(tmp_path, content):
     with pytest.warns(RuntimeWarning, match="damaged-2, which may be deleted"):
         with Checkpoints(tmp_path) as checkpoints:
             assert checkpoints.best_step() == checkpoints.latest_step() == 1
+    with Checkpoints(tmp_path) as checkpoints:  # and without a warning from then on
+        assert checkpoints.latest_step() == 1
 
 
 @pytest.mark.parametrize(

@@ -107,6 +107,24 @@ def test_a_stopped_run_ends_as_an_unbroken_one(unbroken, tmp_path, stops):
     assert_same_run(tmp_path, unbroken)
 
 
+def test_trained_networks_are_judged_once_before_the_first_step(tmp_path):
+    task = stand_in.task()._replace(networks=("matrix", "offset"))
+    pairs = stand_in.source()
+
+    def killed_at_once(start):
+        raise Stopped
+        yield
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stand_in, "task", lambda: task)
+        for _ in range(2):
+            with pytest.raises(Stopped):
+                stand_in.train(tmp_path, pairs._replace(arrays=killed_at_once))
+        stand_in.train(tmp_path)
+    rows = np.genfromtxt(tmp_path / "validation.csv", delimiter=",", names=True)
+    assert list(rows["step"]) == [0, 4, 8, 12]
+
+
 def test_a_signal_within_a_row_of_the_log_leaves_no_trace(tmp_path):
     config = dataclasses.replace(stand_in.TRAIN, log_every=4, checkpoint_every=4)
     stand_in.train(tmp_path / "unbroken", config=config)
