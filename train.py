@@ -29,7 +29,7 @@ from dbdnet_jax.networks.weights import save_params
 from dbdnet_jax.training.config import parse_flags, read_config
 from dbdnet_jax.training.loop import fit
 from dbdnet_jax.training.parallel import join_processes
-from dbdnet_jax.training.preemption import Preempted, interrupt_on_signals
+from dbdnet_jax.training.preemption import Interrupted, Preempted, interrupt_on_signals
 from dbdnet_jax.training.run_folder import JOINT, load_best
 from dbdnet_jax.training.table import STAGES
 
@@ -74,7 +74,7 @@ def main(argv: list[str]) -> None:
         sys.exit(f"error: {error}")
     except Preempted as stopped:
         print(f"{stopped} The same command goes on from there.")
-    except KeyboardInterrupt:
+    except Interrupted:
         print("Stopped. The same command goes on from the last checkpoint.")
 
 

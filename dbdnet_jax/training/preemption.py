@@ -19,6 +19,13 @@ class Preempted(Exception):
     """A training was asked to stop and has saved its state; the text says where it goes on."""
 
 
+class Interrupted(BaseException):
+    """A signal came where there is nothing to save.
+
+    Not KeyboardInterrupt: Python may end with a status of its own after one, caught or not.
+    """
+
+
 class StopRequest:
     """Whether one of the `SIGNALS` has come: ``name`` is the last one's, "" before."""
 
@@ -33,7 +40,7 @@ class StopRequest:
         if number == signal.SIGHUP:
             _leave_terminal()
         if again and number == signal.SIGINT:
-            raise KeyboardInterrupt
+            raise Interrupted
 
     def asked(self, step: int) -> str:
         """The signal after which to stop at ``step``, or "".
@@ -55,12 +62,12 @@ def stop_requests() -> Iterator[StopRequest]:
 
 @contextlib.contextmanager
 def interrupt_on_signals() -> Iterator[None]:
-    """Within it all of the `SIGNALS` raise KeyboardInterrupt, as Ctrl-C does."""
+    """Within it all of the `SIGNALS` raise `Interrupted`, at once."""
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         if number == signal.SIGHUP:
             _leave_terminal()
-        raise KeyboardInterrupt
+        raise Interrupted
 
     with _handled_by(interrupt):
         yield
