@@ -28,8 +28,8 @@ from dbdnet_jax.evaluation.tables import render, save
 from dbdnet_jax.io.files import require_writable, write_atomic
 from dbdnet_jax.io.programs import keep_compiled_programs, require_device
 from dbdnet_jax.networks.weights import PRETRAINED, load_named
-from dbdnet_jax.training.checkpoint import load_best, was_trained
 from dbdnet_jax.training.config import parse_flags, read_config
+from dbdnet_jax.training.run_folder import load_best, was_trained
 from dbdnet_jax.training.task import RunConfig
 
 CONFIG = config_flags.DEFINE_config_file("config", None, "Configuration file, configs/NAME.py.")

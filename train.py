@@ -4,7 +4,8 @@
     python train.py --config=configs/cad.py --config.train.batch_size=4 --run_dir=runs/mine
     python train.py --config=configs/cad.py --stage=joint  # goes on from runs/cad
 
-A run that was stopped goes on when the same command is given again. The best weights end up in
+A run that was stopped goes on when the same command is given again; SIGTERM, SIGHUP and Ctrl-C save
+its state first and end it with status 0. The best weights end up in
 RUN_DIR/params.npz, the curves in RUN_DIR/STAGE/*.csv and, for TensorBoard, beside them.
 """
 
@@ -25,9 +26,11 @@ from dbdnet_jax.evaluation.tables import render, save
 from dbdnet_jax.io.programs import keep_compiled_programs, require_device
 from dbdnet_jax.networks.table import LEARNED
 from dbdnet_jax.networks.weights import save_params
-from dbdnet_jax.training.checkpoint import JOINT, load_best
 from dbdnet_jax.training.config import parse_flags, read_config
 from dbdnet_jax.training.loop import fit
+from dbdnet_jax.training.parallel import join_processes
+from dbdnet_jax.training.preemption import Interrupted, Preempted, interrupt_on_signals
+from dbdnet_jax.training.run_folder import JOINT, load_best
 from dbdnet_jax.training.table import STAGES
 
 CONFIG = config_flags.DEFINE_config_file("config", None, "Configuration file, configs/NAME.py.")
@@ -35,6 +38,12 @@ RUN_DIR = flags.DEFINE_string("run_dir", None, "Where results go; runs/NAME if n
 STAGE = flags.DEFINE_string(
     "stage", "all", "What to train: a stage of the method, or all (or both) but joint."
 )
+DISTRIBUTED = flags.DEFINE_bool(
+    "distributed", False, "One of several processes that train together; see docs/scaling.md."
+)
+COORDINATOR = flags.DEFINE_string("coordinator", None, "HOST:PORT of process 0 of several.")
+PROCESSES = flags.DEFINE_integer("processes", None, "How many train together.", lower_bound=1)
+PROCESS_ID = flags.DEFINE_integer("process_id", None, "Which of them this is, from 0.")
 EVALUATE = flags.DEFINE_bool("evaluate", True, "Print the table of results at the end.")
 
 
@@ -59,40 +68,54 @@ def main(argv: list[str]) -> None:
     config_file = config_flags.get_config_filename(flags.FLAGS["config"])
     run_dir = Path(RUN_DIR.value or Path("runs") / Path(config_file).stem)
     try:
-        config = read_config(CONFIG.value)
-        stages = stages_of(config.method, STAGE.value)
-        # Before anything asks JAX for a device: the number is fixed from then on. More devices
-        # than pairs in a step would have nothing to do.
-        pairs = max(stage.batch_size for stage in config.stages.values())
-        devices = config.train.devices or min(os.cpu_count() or 1, pairs)
-        jax.config.update("jax_num_cpu_devices", devices)
-        keep_compiled_programs()
-        require_device()
-        for stage in stages:
-            stream = load_training_pairs(
-                config.data,
-                config.protocol,
-                seed=config.train.seed,
-                validation_pairs=config.train.validation_pairs,
-                batch_size=config.stages[stage].batch_size,
-            )
-            fit(config, stage, run_dir, stream)
-        params = load_best(run_dir)
-        save_params(run_dir / "params.npz", params)
-        print(f"The best weights are in {run_dir / 'params.npz'}.")
-        if EVALUATE.value and set(LEARNED[config.method].parts) <= params.networks.keys():
-            evaluation = evaluate(
-                [Weights("params", params)],
-                load_test_pairs(config.data, config.protocol, run_dir),
-                seed=config.train.seed,
-                command=shlex.join(["python", *sys.argv]),
-            )
-            print(render(evaluation))
-            save(evaluation, run_dir)
+        with interrupt_on_signals():
+            train(run_dir)
     except (ValueError, OSError, FloatingPointError) as error:
         sys.exit(f"error: {error}")
-    except KeyboardInterrupt:
-        sys.exit("Stopped. The same command goes on from the last checkpoint.")
+    except Preempted as stopped:
+        print(f"{stopped} The same command goes on from there.")
+    except Interrupted:
+        print("Stopped. The same command goes on from the last checkpoint.")
+
+
+def train(run_dir: Path) -> None:
+    """`main` between its flags and its errors."""
+    config = read_config(CONFIG.value)
+    stages = stages_of(config.method, STAGE.value)
+    # Before anything asks JAX for a device: the number is fixed from then on. More devices
+    # than pairs in a step would have nothing to do.
+    pairs = max(stage.batch_size for stage in config.stages.values())
+    devices = config.train.devices // (PROCESSES.value or 1) or min(os.cpu_count() or 1, pairs)
+    jax.config.update("jax_num_cpu_devices", devices)
+    if DISTRIBUTED.value or COORDINATOR.value:
+        join_processes(COORDINATOR.value, PROCESSES.value, PROCESS_ID.value)
+    keep_compiled_programs()
+    require_device()
+    for stage in stages:
+        stream = load_training_pairs(
+            config.data,
+            config.protocol,
+            seed=config.train.seed,
+            validation_pairs=config.train.validation_pairs,
+            batch_size=config.stages[stage].batch_size,
+        )
+        fit(config, stage, run_dir, stream)
+    params = load_best(run_dir)
+    if jax.process_index():
+        return  # the first process does the rest
+    save_params(run_dir / "params.npz", params)
+    print(f"The best weights are in {run_dir / 'params.npz'}.")
+    if jax.process_count() > 1:
+        print("Several processes make no table of results; evaluate.py does.")
+    elif EVALUATE.value and set(LEARNED[config.method].parts) <= params.networks.keys():
+        evaluation = evaluate(
+            [Weights("params", params)],
+            load_test_pairs(config.data, config.protocol, run_dir),
+            seed=config.train.seed,
+            command=shlex.join(["python", *sys.argv]),
+        )
+        print(render(evaluation))
+        save(evaluation, run_dir)
 
 
 if __name__ == "__main__":

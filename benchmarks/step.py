@@ -39,7 +39,7 @@ from dbdnet_jax.networks.initial import init_params
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.training.config import parse_flags, read_config
 from dbdnet_jax.training.optimizer import make_optimizer
-from dbdnet_jax.training.parallel import on_all_devices
+from dbdnet_jax.training.parallel import on_all_devices, training_mesh
 from dbdnet_jax.training.step import init_state, train_step
 from dbdnet_jax.training.table import STAGES
 from dbdnet_jax.training.task import RunConfig
@@ -69,17 +69,21 @@ def training_step(
     optimizer = make_optimizer(
         lambda _: part.learning_rate, weight_decay=train.weight_decay, clip_norm=train.clip_norm
     )
+    mesh = training_mesh(part.batch_size, train.devices)
     step = functools.partial(
         train_step,
         draw=stream.draw,
         loss=task.loss,
         optimizer=optimizer,
         batch_size=part.batch_size,
+        mesh=mesh,
         ema_decay=train.ema_decay,
+        accumulate=train.accumulate,
+        remat=train.remat,
     )
-    state = on_all_devices(init_state(task.trainable, optimizer, ema_decay=train.ema_decay))
+    state = on_all_devices(mesh, init_state(task.trainable, optimizer, ema_decay=train.ema_decay))
     # All four, so that the program may be called with what it was compiled for.
-    rest = on_all_devices((task.frozen, jax.random.key(0), next(stream.arrays(0))))
+    rest = on_all_devices(mesh, (task.frozen, jax.random.key(0), next(stream.arrays(0))))
     program, figures = compile_timed(step, state, *rest)
     figures |= measure(lambda: program(state, *rest)[1].loss, STEPS.value)
     seconds = figures["median_s"]

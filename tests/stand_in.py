@@ -1,10 +1,5 @@
-"""A training task that compiles in a second: the loop, the checkpoints and the log do not care.
+"""A training task that compiles in a second: the loop, the checkpoints and the log do not care."""
 
-As a program, it trains in the folder given: what a test kills and starts again.
-"""
-
-import sys
-import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -96,19 +91,3 @@ def train(folder: Path, pairs: PairStream | None = None, config: TrainConfig = T
         batch_size=BATCH,
         learning_rate=RATE,
     )
-
-
-def slowly(pairs: PairStream, seconds: float) -> PairStream:
-    """A source that takes its time, so that there is time to be killed in."""
-
-    def arrays(start):
-        for these in pairs.arrays(start):
-            time.sleep(seconds)
-            yield these
-
-    return pairs._replace(arrays=arrays)
-
-
-if __name__ == "__main__":
-    jax.config.update("jax_num_cpu_devices", 2)
-    train(Path(sys.argv[1]), slowly(source(), float(sys.argv[2])))

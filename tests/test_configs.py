@@ -169,7 +169,8 @@ def test_a_stage_may_resume_only_with_what_decides_its_outcome():
     assert stage_record(base, "overlap") == stage_record(other, "overlap")
     assert stage_record(base, "registration") != stage_record(other, "registration")
     assert stage_record(base, "joint") != stage_record(other, "joint")  # its loss is of both
-    more_devices = read_config(with_change(registration__epochs=1.0, train__devices=3))
+    elsewhere = {"train__devices": 3, "train__accumulate": 2, "train__remat": True}
+    more_devices = read_config(with_change(registration__epochs=1.0, **elsewhere))
     assert stage_record(base, "registration") == stage_record(more_devices, "registration")
 
 
@@ -181,6 +182,7 @@ def test_a_stage_may_resume_only_with_what_decides_its_outcome():
         ({"trian": {}}, r"Did you mean config\.train\?"),
         ({"data__name": "modelnet"}, r"one of \('cad', 'modelnet40', 'threedmatch'\); got 'mod"),
         ({"train__log_every": 30}, r"validate_every must be a multiple of .*log_every = 30"),
+        ({"train__accumulate": 0}, r"accumulate must be at least 1; got 0"),
         ({"train__validation_pairs": 0}, r"validation_pairs must be at least 1; got 0"),
         ({"overlap__epochs": 0.0}, r"config\.overlap\.epochs must be positive; got 0"),
         ({"method": "icp"}, r"config\.method must be one of dbdnet, masknet.*; got 'icp'"),

@@ -25,8 +25,8 @@ from dbdnet_jax.evaluation.methods import Method, from_network
 from dbdnet_jax.evaluation.run import evaluate_method
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import PRETRAINED, load_params, save_params
-from dbdnet_jax.training.checkpoint import load_best
 from dbdnet_jax.training.config import read_config
+from dbdnet_jax.training.run_folder import load_best
 from dbdnet_jax.types import Pair
 
 

@@ -1,11 +1,33 @@
 """Where the package keeps what it need not make twice, and files that appear whole or not."""
 
+import errno
 import functools
 import os
+import re
 import stat
 import uuid
 import warnings
 from pathlib import Path
+
+# What says nothing of a file's content: limits and rights of the process, the disk, its server.
+MACHINE_ERRORS = {
+    getattr(errno, name)
+    for name in (
+        *(
+            "EMFILE",
+            "ENFILE",
+            "ENOMEM",
+            "EACCES",
+            "EPERM",
+            "EROFS",
+            "ENOSPC",
+            "EDQUOT",
+            "EFBIG",
+            "EIO",
+        ),
+        *("ESTALE", "ETIMEDOUT", "EAGAIN", "EBUSY"),
+    )
+}
 
 
 def cache_folder(name: str) -> Path | None:
@@ -44,6 +66,25 @@ def require_writable(folder: Path) -> None:
             f"the folder {folder} must be one that files can be written to; {there}: "
             f"{error.strerror}. Choose another, or make room."
         ) from error
+
+
+def machine_error(error: BaseException, path: Path) -> OSError | None:
+    """The error of the machine (`MACHINE_ERRORS`) that made reading or writing ``path`` fail.
+
+    ``error`` may be any library's: what caused it is looked at too, and TensorStore's text. None
+    where no such error is behind it.
+    """
+    seen: BaseException | None = error
+    while seen is not None:
+        number = seen.errno if isinstance(seen, OSError) else None
+        if isinstance(seen, MemoryError):
+            number = errno.ENOMEM
+        if number is None and (said := re.search(r"\[OS error (\d+):", str(seen))):
+            number = int(said[1])
+        if number is not None and number in MACHINE_ERRORS:
+            return OSError(number, os.strerror(number), str(path))
+        seen = seen.__cause__ or seen.__context__
+    return None
 
 
 @functools.cache  # once for each reason, however many programs are kept

@@ -1,43 +1,49 @@
 """Checkpoints of a training run: the newest two and the best one, each written as a whole.
 
-A run folder holds one folder for each stage, named as the network it trains (``joint``: all of
-them, further); in it ``stage.json`` says what the stage trains, of which method, and
-``checkpoints/STEP`` holds a state at a step.
+``checkpoints/STEP`` in a stage's folder (`dbdnet_jax.training.run_folder`) holds a state at a step.
 Weights to share are another matter: see `dbdnet_jax.networks.weights`.
 """
 
 from __future__ import annotations
 
 import json
+import warnings
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental import multihost_utils
 
 from dbdnet_jax.errors import CheckpointError
-from dbdnet_jax.io.files import write_atomic
+from dbdnet_jax.io.files import machine_error
 from dbdnet_jax.networks.batch_norm import join_batch_stats
-from dbdnet_jax.networks.params import Params
-from dbdnet_jax.networks.table import DEFAULT_METHOD, LEARNED
-from dbdnet_jax.networks.weights import read_model
 
-JOINT = "joint"  # all networks of a method, further
 KEPT = 2  # newest checkpoints; the second survives when the first is damaged
 
 State = TypeVar("State")
+
+
+class Resumed(NamedTuple):
+    """What a run goes on from: ``window`` holds the steps' numbers since the log's last row."""
+
+    step: int
+    state: Any
+    window: list[dict[str, float]]
 
 
 class Checkpoints:
     """The checkpoints of one stage, in ``folder/checkpoints``; created if need be.
 
     Orbax writes each one under a temporary name and renames it, so that a run killed while
-    writing leaves the ones before it as they were.
+    writing leaves the ones before it as they were. What a kill left is deleted, but for
+    ``read_only``, beside which a training may be writing.
     """
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder: Path, *, read_only: bool = False):
         from orbax.checkpoint import v1 as ocp
 
         keep = ocp.training.preservation_policies
@@ -48,16 +54,20 @@ class Checkpoints:
             n=1,
             keep_checkpoints_without_metrics=False,
         )
+        damaged = self._without_metrics()
+        if damaged and read_only:
+            raise CheckpointError(_advice(damaged))
+        _set_aside(damaged)
         try:
             self._orbax = ocp.training.Checkpointer(
                 self.folder,
                 preservation_policy=keep.AnyPreservationPolicy([keep.LatestN(KEPT), best]),
-                cleanup_tmp_directories=True,
+                cleanup_tmp_directories=not read_only,
             )
         except Exception as error:  # Orbax raises many kinds; none of them says what to do
-            raise CheckpointError(
+            raise machine_error(error, self.folder) or CheckpointError(
                 f"checkpoints must be readable; those in {self.folder} are not "
-                f"({_first_line(error)}). Delete that folder and start the stage again."
+                f"({first_line(error)}). Move what is no checkpoint out of that folder."
             ) from error
 
     def __enter__(self) -> Checkpoints:
@@ -78,160 +88,139 @@ class Checkpoints:
             min(validated, key=lambda c: (c.metrics["error"], -c.step)).step if validated else None
         )
 
-    def save(self, step: int, state: Any, error: float | None = None) -> None:
-        """Write ``state`` and delete what need not be kept; ``error`` is the validation's."""
+    def save(
+        self,
+        step: int,
+        state: Any,
+        error: float | None = None,
+        window: Sequence[dict[str, float]] = (),
+    ) -> None:
+        """Write ``state`` and delete what need not be kept; ``error`` is the validation's.
+
+        Raises:
+            OSError: the disk is full, or another error of the machine.
+        """
         state = jax.device_get(state)  # NumPy arrays: readable whatever devices there are then
-        self._orbax.save(
-            step,
-            state,
-            metrics=None if error is None else {"error": error},
-            custom_metadata={"crc32": _checksum(state)},
-            force=True,
-        )
+        try:
+            self._orbax.save(
+                step,
+                state,
+                metrics=None if error is None else {"error": error},
+                custom_metadata={"crc32": _checksum(state), "window": list(window)},
+                force=True,
+            )
+        except Exception as failure:  # which kind depends on where Orbax was
+            if of_machine := machine_error(failure, self.folder):
+                raise of_machine from failure
+            raise
+
+    def resume(self, like: State) -> Resumed | None:
+        """The newest checkpoint that is whole, as `restore` gives it; None if there is none at all.
+
+        Damaged ones that are newer are renamed ``damaged-STEP``, with a warning.
+
+        Raises:
+            CheckpointError: there are checkpoints, and all are damaged.
+        """
+        damaged: dict[Path, str] = {}
+        for step in sorted((found.step for found in self._orbax.checkpoints), reverse=True):
+            state, damage = self._read(step, _numpy_like(like))
+            if damage:
+                damaged[self._path(step)] = damage
+                continue
+            _set_aside(damaged)
+            self._orbax.reload()
+            window = self._orbax.metadata(step).custom_metadata.get("window", [])
+            return Resumed(step, jax.tree.map(jnp.asarray, state), window)
+        if damaged:
+            raise CheckpointError(_advice(damaged))
+        return None
 
     def restore(self, step: int, like: State) -> State:
         """The state of ``step``, with the structure, shapes and types of ``like``.
 
         Raises:
             CheckpointError: it cannot be read, or is not what was written.
+            OSError: the machine could not read it, which says nothing of the checkpoint.
         """
-        like = jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), like)
-        return jax.tree.map(jnp.asarray, self._read(step, like))
+        return jax.tree.map(jnp.asarray, self._intact(step, _numpy_like(like)))
 
     def restore_weights(self, step: int) -> Any:
         """The weights of ``step`` to use: their moving average where one was kept.
 
         With them the running averages of batch norms, where there are any.
         """
-        state = self._read(step, None)
+        state = self._intact(step, None)
         weights = state["params"] if state.get("ema") is None else state["ema"]
         if state.get("batch_stats") is not None:
             weights = join_batch_stats(weights, state["batch_stats"])
         return jax.tree.map(jnp.asarray, weights)
 
-    def _read(self, step: int, like: Any) -> Any:
+    def _intact(self, step: int, like: Any) -> Any:
+        state, damage = self._read(step, like)
+        if damage:
+            raise CheckpointError(_advice({self._path(step): damage}))
+        return state
+
+    def _read(self, step: int, like: Any) -> tuple[Any, str]:
+        """The state of ``step``, and what is wrong with it ("": nothing)."""
         try:
             written = self._orbax.metadata(step).custom_metadata["crc32"]
             state = self._orbax.load(step, like)
-            intact = _checksum(state) == written  # Orbax does not notice a flipped bit
-            reason = "its checksum is wrong"
-        except Exception as error:
-            intact, reason = False, _first_line(error)
-        if not intact:
-            others = [c.step for c in self._orbax.checkpoints if c.step < step]
-            then = f"the one before it, step {others[-1]}," if others else "the start"
-            raise CheckpointError(
-                f"a checkpoint must be as it was written; {self.folder / str(step)} is damaged "
-                f"({reason}). Delete that folder: training then goes on from {then} again."
-            )
-        return state
+        except Exception as error:  # which kind depends on which file is damaged
+            if failure := machine_error(error, self._path(step)):
+                raise failure from error
+            return None, first_line(error)
+        # Orbax does not notice a flipped bit.
+        return state, "" if _checksum(state) == written else "its checksum is wrong"
+
+    def _path(self, step: int) -> Path:
+        return self.folder / str(step)
+
+    def _without_metrics(self) -> dict[Path, str]:
+        """Checkpoints whose metrics cannot be read, which would keep Orbax from reading any."""
+        found = {}
+        for path in self.folder.glob("*/metrics/metrics"):
+            checkpoint = path.parents[1]
+            if not checkpoint.name.isdigit():  # half written, or set aside
+                continue
+            try:
+                float(json.loads(path.read_bytes())["error"])
+            except (ValueError, KeyError, TypeError) as error:
+                found[checkpoint] = f"its metrics: {first_line(error)}"
+        return found
 
 
-def write_stage(
-    folder: Path, record: dict[str, Any], defaults: dict[str, Any] | None = None
-) -> None:
-    """Put ``stage.json`` into a stage's folder, or check that the one there says the same.
+def _set_aside(damaged: dict[Path, str]) -> None:
+    """Rename damaged checkpoints, each with a warning: the steps are taken again, and saved.
 
-    What an older release did not write is taken from ``defaults``, a part of a record.
-
-    Raises:
-        CheckpointError: the folder is of another configuration; names the first field that differs.
+    Of several processes the first does it, and the others wait.
     """
-    path = folder / "stage.json"
-    record = json.loads(json.dumps(record))
-    if not path.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        write_atomic(path, (json.dumps(record, indent=1) + "\n").encode())
-        return
-    wanted, known = _flatten(record), _flatten(json.loads(json.dumps(defaults or {})))
-    found = {name: known[name] for name in known if name in wanted}
-    found |= _flatten(read_stage(folder))
-    for name in sorted(found.keys() | wanted.keys()):
-        if found.get(name) != wanted.get(name):
-            raise CheckpointError(
-                f"a run can only go on with the configuration it was started with; {folder} has "
-                f"{name} = {found.get(name)}, this configuration {wanted.get(name)}. Give another "
-                "--run_dir, or delete that folder to start anew."
-            )
-
-
-def read_stage(folder: Path) -> dict[str, Any]:
-    """What ``stage.json`` in a stage's folder says.
-
-    Raises:
-        CheckpointError: there is none, or it is damaged.
-    """
-    path = folder / "stage.json"
-    try:
-        return json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise CheckpointError(
-            f"a stage's folder must hold a readable stage.json; {path} is not "
-            f"({_first_line(error)}). Give the folder of a run of train.py, or delete {folder} and "
-            "train again."
-        ) from error
-
-
-def load_best(run_dir: str | Path, *, joint: bool = True) -> Params:
-    """The best weights of a run: of each stage that was trained, the smallest validation error.
-
-    Those of the joint stage where it has any, unless ``joint`` is False.
-
-    Raises:
-        CheckpointError: no stage has a validated checkpoint, or one is damaged.
-    """
-    networks: dict[str, Any] = {}
-    model = None
-    method = _method(Path(run_dir))
-    parts = LEARNED[method].parts
-    for stage in (*parts, JOINT) if joint else parts:
-        folder = Path(run_dir) / stage
-        if not (folder / "checkpoints").is_dir():
-            continue
-        with Checkpoints(folder) as checkpoints:
-            step = checkpoints.best_step()
-            if step is not None:
-                found = checkpoints.restore_weights(step)
-                networks |= found if stage == JOINT else {stage: found}
-                model = _model_config(folder, method)
-    if model is None:
-        raise CheckpointError(
-            f"a run folder must hold a validated checkpoint; {run_dir} has none. Train first: "
-            "python train.py --config=configs/NAME.py --run_dir=..."
+    for path, reason in damaged.items() if jax.process_index() == 0 else ():
+        count = sum(1 for _ in path.parent.glob(f"damaged-{path.name}*"))
+        aside = path.with_name(f"damaged-{path.name}" + (f"-{count}" if count else ""))
+        warnings.warn(
+            f"the checkpoint {path} is damaged ({reason}) and skipped; it is now {aside}, which "
+            "may be deleted.",
+            RuntimeWarning,
+            stacklevel=4,
         )
-    return Params(networks, model)
+        path.rename(aside)
+    multihost_utils.sync_global_devices("damaged checkpoints are set aside")
 
 
-def was_trained(run_dir: str | Path) -> bool:
-    """Whether a folder holds checkpoints of any stage."""
-    return any(Path(run_dir).glob("*/checkpoints"))
+def _advice(damaged: dict[Path, str]) -> str:
+    """Which checkpoints are damaged, why, and what to do."""
+    named = ", ".join(f"{path} is damaged ({reason})" for path, reason in damaged.items())
+    return (
+        f"a checkpoint must be as it was written; {named}. Delete what is named here: the "
+        "newest of the others is used then, or training starts anew where there is none."
+    )
 
 
-def _method(run_dir: Path) -> str:
-    """The method that a run's stages train; that of every stage must be the same."""
-    found = {
-        path.parent.name: read_stage(path.parent).get("method", DEFAULT_METHOD)
-        for path in sorted(run_dir.glob("*/stage.json"))
-    }
-    methods = set(found.values()) or {DEFAULT_METHOD}
-    if len(methods) > 1 or not methods <= LEARNED.keys():
-        raise CheckpointError(
-            f"all stages of a run must train one method out of {', '.join(LEARNED)}; those in "
-            f"{run_dir} are of {found}. Give each method a --run_dir of its own, or use the "
-            "version of dbdnet_jax that trained it."
-        )
-    return methods.pop()
-
-
-def _model_config(folder: Path, method: str) -> Any:
-    try:
-        return read_model(method, read_stage(folder)["model"], str(folder / "stage.json"))
-    except (KeyError, TypeError, CheckpointError) as error:
-        raise CheckpointError(
-            f"'model' in {folder / 'stage.json'} must be the fields of "
-            f"{LEARNED[method].config.__name__} ({_first_line(error)}). Use the version of "
-            "dbdnet_jax that trained it, or train again."
-        ) from error
+def _numpy_like(tree: Any) -> Any:
+    """What Orbax is told to read: NumPy arrays, whatever devices there are."""
+    return jax.tree.map(lambda leaf: np.empty(leaf.shape, leaf.dtype), tree)
 
 
 def _checksum(tree: Any) -> int:
@@ -239,16 +228,6 @@ def _checksum(tree: Any) -> int:
     return sum(zlib.crc32(np.asarray(leaf).tobytes()) for leaf in jax.tree.leaves(tree))
 
 
-def _flatten(record: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in record.items():
-        flat |= (
-            _flatten(value, f"{prefix}{name}.")
-            if isinstance(value, dict)
-            else {prefix + name: value}
-        )
-    return flat
-
-
-def _first_line(error: BaseException) -> str:
+def first_line(error: BaseException) -> str:
+    """What went wrong, short enough to be a part of a sentence."""
     return f"{type(error).__name__}: {error}".splitlines()[0][:200]

@@ -152,7 +152,8 @@ def stage_record(config: RunConfig, stage: str) -> dict[str, Any]:
     }
     if config.train.schedule == "constant":
         del record[stage]["epochs"]
-    for name in ("devices", "batch_size", "learning_rate"):  # the stage holds the last two
+    # Of the first three only rounding depends; the stage holds the last two.
+    for name in ("devices", "accumulate", "remat", "batch_size", "learning_rate"):
         del record["train"][name]
     return record if config.method == DEFAULT_METHOD else {"method": config.method, **record}
 

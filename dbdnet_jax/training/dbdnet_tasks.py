@@ -9,7 +9,6 @@ from typing import Any
 from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.params import Params
-from dbdnet_jax.training.checkpoint import load_best
 from dbdnet_jax.training.dbdnet import (
     joint_loss_of,
     overlap_loss_of,
@@ -18,6 +17,7 @@ from dbdnet_jax.training.dbdnet import (
     validate_overlap,
     validate_registration,
 )
+from dbdnet_jax.training.run_folder import load_best
 from dbdnet_jax.training.start import initial_params, load_start
 from dbdnet_jax.training.task import RunConfig, Task
 

@@ -6,6 +6,7 @@ with the same parameters, bit for bit on a CPU.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import math
@@ -16,13 +17,17 @@ from typing import Any
 
 import jax
 import optax
+from jax.sharding import Mesh
 from jaxtyping import Array
 
 from dbdnet_jax.data.training_pairs import PairStream
-from dbdnet_jax.training.checkpoint import Checkpoints, write_stage
+from dbdnet_jax.training.checkpoint import Checkpoints
 from dbdnet_jax.training.config import stage_defaults, stage_record
+from dbdnet_jax.training.lock import sole_training
 from dbdnet_jax.training.optimizer import make_optimizer, make_schedule
-from dbdnet_jax.training.parallel import mean_over_pairs, on_all_devices
+from dbdnet_jax.training.parallel import mean_over_pairs, on_all_devices, training_mesh
+from dbdnet_jax.training.preemption import Preempted, stop_requests
+from dbdnet_jax.training.run_folder import write_stage
 from dbdnet_jax.training.runlog import RunLog
 from dbdnet_jax.training.step import StepMetrics, TrainState, init_state, train_step, weights_of
 from dbdnet_jax.training.table import STAGES
@@ -37,9 +42,11 @@ def fit(config: RunConfig, stage: str, run_dir: str | Path, stream: PairStream) 
     A finished stage returns at once.
 
     Raises:
-        CheckpointError: a damaged checkpoint, or a folder of another configuration.
+        CheckpointError: all checkpoints damaged, or a folder of another configuration.
+        BlockingIOError: another process trains this stage in this folder; says which.
         FloatingPointError: a loss term or a gradient is not finite; says which, at which step, and
             where the last good state is.
+        Preempted: SIGTERM, SIGHUP or SIGINT came; the state after the step of then is saved.
     """
     folder = Path(run_dir) / stage
     task = STAGES[config.method][stage].make_task(config, run_dir)
@@ -85,13 +92,14 @@ def run_task(
         networks=task.networks,
         kind=train.optimizer,
     )
-    with Checkpoints(folder) as checkpoints:
+    mesh = training_mesh(batch_size, train.devices)
+    _require_parts(task, batch_size // mesh.size, train.accumulate)
+    alone = sole_training(folder) if jax.process_index() == 0 else contextlib.nullcontext()
+    with alone, Checkpoints(folder) as checkpoints:
         state = init_state(
             task.trainable, optimizer, ema_decay=train.ema_decay, batch_stats=task.batch_stats
         )
-        start = checkpoints.latest_step() or 0
-        if start:
-            state = checkpoints.restore(start, state)
+        start, state, window = checkpoints.resume(state) or (0, state, [])
         if start >= total:
             return
         step = functools.partial(
@@ -100,11 +108,14 @@ def run_task(
             loss=task.loss,
             optimizer=optimizer,
             batch_size=batch_size,
+            mesh=mesh,
             ema_decay=train.ema_decay,
+            accumulate=train.accumulate,
+            remat=train.remat,
         )
         with RunLog(folder, start) as log:
-            loop = _Loop(task, stream, train, checkpoints, log, schedule, batch_size, total)
-            loop.run(on_all_devices(state), start, jax.jit(step, donate_argnums=0))
+            loop = _Loop(task, stream, train, checkpoints, log, schedule, batch_size, total, mesh)
+            loop.run(on_all_devices(mesh, state), start, window, jax.jit(step, donate_argnums=0))
 
 
 @dataclasses.dataclass
@@ -119,39 +130,62 @@ class _Loop:
     schedule: optax.Schedule
     batch_size: int
     total: int
+    mesh: Mesh
 
-    def run(self, state: TrainState, start: int, step: Callable[..., Any]) -> None:
-        """Take steps ``start`` + 1 to ``total``; log, validate and save on the way."""
+    def run(
+        self,
+        state: TrainState,
+        start: int,
+        window: list[dict[str, float]],
+        step: Callable[..., Any],
+    ) -> None:
+        """Take steps ``start`` + 1 to ``total``; log, validate and save on the way.
+
+        ``window`` holds the numbers of the steps since the last row of the log.
+        """
         train = self.train
         frozen, pairs, key = on_all_devices(
-            (self.task.frozen, self.stream.validation, jax.random.key(train.seed))
+            self.mesh, (self.task.frozen, self.stream.validation, jax.random.key(train.seed))
         )
-        arrays = _on_all_devices(self.stream.arrays(start))
+        arrays = _on_all_devices(self.mesh, self.stream.arrays(start))
         validate = jax.jit(self._mean_validation)
-        window: list[dict[str, float]] = []
         waiting: list[StepMetrics] = []
-        if self.task.networks and not start:
+        if self.task.networks and self.checkpoints.latest_step() is None:
             # They are trained already, and what follows may be worse.
             self._validate_and_save(0, state, validate, frozen, pairs)
-        with self._bar(start) as bar:
+        with stop_requests() as stop, self._bar(start) as bar:
             for done in range(start + 1, self.total + 1):
                 state, metrics = step(state, frozen, key, next(arrays))
                 waiting.append(metrics)
                 at_row = done % train.log_every == 0 or done == self.total
+                stopping = stop.asked(done)
                 # One step late, so that the device always has the next one to work on. A bad step
                 # gives back the state it was given, so the one after it did too.
-                while len(waiting) > (0 if at_row else 1):
+                while len(waiting) > (0 if at_row or stopping else 1):
                     window.append(_scalars(jax.device_get(waiting.pop(0))))
-                    self._require_finite(window[-1], state, "in the step")
+                    self._require_finite(window, state, "in the step")
                     bar.update(self.batch_size)
-                if not at_row:
-                    continue
-                bar.set_postfix(self._write_row(done, window))
-                window = []
-                if done % train.validate_every == 0 or done == self.total:
-                    self._validate_and_save(done, state, validate, frozen, pairs)
-                elif done % train.checkpoint_every == 0:
-                    self.checkpoints.save(done, state)
+                if at_row:
+                    bar.set_postfix(self._write_row(done, window))
+                    window = []
+                    if done % train.validate_every == 0 or done == self.total:
+                        self._validate_and_save(done, state, validate, frozen, pairs)
+                    elif done % train.checkpoint_every == 0:
+                        self.checkpoints.save(done, state)
+                if stopping:
+                    self._stop(done, state, window, stopping)
+            if stop.name:  # it came while the last of it was saved
+                self._stop(self.total, state, [], stop.name)
+
+    def _stop(
+        self, done: int, state: TrainState, window: list[dict[str, float]], signal: str
+    ) -> None:
+        if self.checkpoints.latest_step() != done:
+            self.checkpoints.save(done, state, window=window)
+        raise Preempted(
+            f"Stopped by {signal}; the state after step {done} of {self.total} is saved in "
+            f"{self.checkpoints.folder / str(done)}."
+        )
 
     def _bar(self, start: int) -> Any:
         from tqdm import tqdm
@@ -159,6 +193,7 @@ class _Loop:
         return tqdm(
             desc=self.checkpoints.folder.parent.name,
             total=self.total * self.batch_size,
+            disable=jax.process_index() > 0,
             initial=start * self.batch_size,
             unit="pair",
             # A log file gets a line now and then, not ten a second.
@@ -177,7 +212,7 @@ class _Loop:
     ) -> None:
         means = validate(state, frozen, pairs)
         row = {name: float(value) for name, value in means.items()}
-        self._require_finite(row, state, "in the validation")
+        self._require_finite([row], state, "in the validation")
         self.log.write("validation", done, row)
         self.checkpoints.save(done, state, row["error"])
 
@@ -187,16 +222,25 @@ class _Loop:
             return self.task.validate(weights, frozen, pair)
 
         count = pairs.source.count.shape[0]
-        return mean_over_pairs(one, count, weights_of(state), frozen, pairs)
+        # No more pairs at once than in a step, which fit.
+        rounds = math.ceil(count / self.batch_size) * self.train.accumulate
+        arguments = weights_of(state), frozen, pairs
+        return mean_over_pairs(self.mesh, one, count, *arguments, rounds=rounds)
 
-    def _require_finite(self, scalars: dict[str, float], state: TrainState, where: str) -> None:
-        """Stop at the first value that is not finite, with the last good state on disk."""
+    def _require_finite(
+        self, window: list[dict[str, float]], state: TrainState, where: str
+    ) -> None:
+        """Stop at the first value that is not finite, with the last good state on disk.
+
+        ``window`` ends with the numbers to look at; those before them are of good steps.
+        """
+        *before, scalars = window
         bad = [name for name, value in scalars.items() if not math.isfinite(value)]
         if not bad:
             return
         good, folder = int(state.step), self.checkpoints.folder
         if good and self.checkpoints.latest_step() != good:
-            self.checkpoints.save(good, state)
+            self.checkpoints.save(good, state, window=before)
         raise FloatingPointError(
             f"every loss term and gradient must be finite; '{bad[0]}' is {scalars[bad[0]]} {where} "
             f"after step {good} of {folder.parent}. The last good state is kept: "
@@ -206,12 +250,26 @@ class _Loop:
         )
 
 
-def _on_all_devices(arrays: Iterator[Any]) -> Iterator[Any]:
+def _require_parts(task: Task, pairs: int, parts: int) -> None:
+    """Refuse to divide a device's ``pairs`` of a step into ``parts`` where that cannot be."""
+    if parts > 1 and task.batch_stats is not None:
+        raise ValueError(
+            "config.train.accumulate must be 1 for a network with batch norms, which are of the "
+            f"whole batch; got {parts}. Use 1, and a smaller batch_size."
+        )
+    if pairs % parts:
+        raise ValueError(
+            "config.train.accumulate must divide the pairs that a device takes of a step; got "
+            f"{parts} for {pairs}. Use {math.gcd(pairs, parts)}, or another batch_size."
+        )
+
+
+def _on_all_devices(mesh: Mesh, arrays: Iterator[Any]) -> Iterator[Any]:
     """Each step's arrays where they are needed; what stays the same is moved there once."""
     held = placed = None
     for these in arrays:
         if these is not held:
-            held, placed = these, on_all_devices(these)
+            held, placed = these, on_all_devices(mesh, these)
         yield placed
 
 

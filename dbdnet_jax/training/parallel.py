@@ -8,64 +8,127 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
-
-def on_all_devices(tree: Any) -> Any:
-    """A copy of ``tree`` where `mean_over_pairs` needs it; a step then compiles once."""
-    if jax.default_backend() != "cpu":
-        return jax.device_put(tree)
-    return jax.device_put(tree, NamedSharding(_cpu_mesh(), PartitionSpec()))
+AXIS = "pairs"
 
 
-def mean_over_pairs(function: Callable[..., Any], count: int, *arguments: Any) -> Any:
+def join_processes(
+    coordinator: str | None = None, processes: int | None = None, process_id: int | None = None
+) -> None:
+    """Make this one of several processes that train together, before JAX has made any device.
+
+    ``coordinator`` is the HOST:PORT of process 0. What is None is taken from the scheduler's
+    environment, as `jax.distributed.initialize` knows it: Slurm, Open MPI, a TPU pod.
+
+    Raises:
+        ValueError: the environment does not say, or the others cannot be reached.
+    """
+    try:
+        jax.distributed.initialize(coordinator, processes, process_id)
+    except (ValueError, RuntimeError) as error:
+        raise ValueError(
+            "processes that train together must know and reach each other; got --coordinator="
+            f"{coordinator}, --processes={processes}, --process_id={process_id} "
+            f"({str(error).splitlines()[0][:200]}). Give all three, or start them by a scheduler."
+        ) from error
+
+
+def training_mesh(batch_size: int, devices: int = 0) -> Mesh:
+    """The first ``devices``, as many of each process, which share each batch; 0: all there are.
+
+    On a CPU, where XLA makes as many devices as it is told to, 0 is the most that the batch can be
+    divided among.
+
+    Raises:
+        ValueError: there are fewer, or they cannot share the batch; says what would fit.
+    """
+    processes, there = jax.process_count(), jax.device_count()
+    if devices > there or devices % processes:
+        raise ValueError(
+            f"config.train.devices must be at most the {there} devices there are, and as many in "
+            f"each of the {processes} processes; got {devices}. Use 0 for all."
+        )
+    if not devices and jax.default_backend() == "cpu":
+        shares = range(processes, there + 1, processes)
+        devices = max((n for n in shares if batch_size % n == 0), default=there)
+    size = devices or there
+    if batch_size % size:
+        below = batch_size - batch_size % size
+        fitting = " or ".join(str(n) for n in (below, below + size) if n)
+        raise ValueError(
+            f"the batch must be divisible by the {size} devices that share it; got a batch_size of "
+            f"{batch_size}. Use a batch_size of {fitting} (any multiple of {size}), or "
+            f"--config.train.devices={math.gcd(batch_size, size)}."
+        )
+    found = sorted(jax.devices(), key=lambda device: (device.process_index, device.id))
+    of_each = np.asarray(found).reshape(processes, -1)[:, : size // processes]
+    return Mesh(of_each.reshape(-1), (AXIS,), axis_types=(AxisType.Auto,))
+
+
+def on_all_devices(mesh: Mesh, tree: Any) -> Any:
+    """A copy of ``tree`` on each device of the mesh; a step then compiles once."""
+    everywhere = NamedSharding(mesh, PartitionSpec())
+
+    def put(leaf: Any) -> Any:
+        # JAX moves no typed key to the devices of other processes, but the numbers in it.
+        if jax.process_count() > 1 and jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(put(jax.random.key_data(leaf)))
+        return jax.device_put(leaf, everywhere)
+
+    return jax.tree.map(put, tree)
+
+
+def mean_over_pairs(
+    mesh: Mesh, function: Callable[..., Any], count: int, *arguments: Any, rounds: int = 1
+) -> Any:
     """The mean of ``function(i, *arguments)`` over i in 0..count-1; the one place with a batch.
 
-    On a GPU or TPU all pairs at once. On a CPU one after another on each XLA device: XLA's own
-    threads give almost nothing at these sizes, a device for each core does. Bit for bit the same
-    for the same number of devices only, as the order of the sum depends on it.
+    The devices share the numbers. On a GPU or TPU each takes its part in ``rounds``, all pairs of a
+    round at once; on a CPU pair by pair: XLA's own threads give almost nothing at these sizes, a
+    device for each core does. Bit for bit the same for the same devices and rounds only, as the
+    order of the sum depends on them.
     """
-    if jax.default_backend() != "cpu":
-        values = jax.vmap(lambda i: function(i, *arguments))(jnp.arange(count, dtype=jnp.int32))
-        return jax.tree.map(lambda value: jnp.mean(value, axis=0), values)
     function = jax.jit(function)  # traced once, for its shapes and for the sum
-    mesh = _cpu_mesh()
-    rounds = math.ceil(count / mesh.size)
+    by_pair = jax.default_backend() == "cpu"
+    rounds = 1 if by_pair else rounds
+    each = rounds * math.ceil(count / (mesh.size * rounds))  # numbers of a device
 
-    def local(numbers: Int[Array, " rounds"], *arguments: Any) -> Any:
-        def add(total: Any, i: Int[Array, ""]) -> tuple[Any, None]:
-            value = function(i, *arguments)
+    def local(numbers: Int[Array, " each"], *arguments: Any) -> Any:
+        def value(i: Int[Array, ""]) -> Any:
             # Numbers from count on only fill the last round.
-            return jax.tree.map(lambda t, v: t + jnp.where(i < count, v, 0), total, value), None
+            found = function(i, *arguments)
+            return jax.tree.map(lambda leaf: jnp.where(i < count, leaf, 0), found)
+
+        def add(total: Any, some: Int[Array, ...]) -> tuple[Any, None]:
+            if by_pair:
+                return jax.tree.map(jnp.add, total, value(some)), None
+            values = jax.vmap(value)(some)
+            return jax.tree.map(lambda t, v: t + jnp.sum(v, axis=0), total, values), None
 
         shapes = jax.eval_shape(function, numbers[0], *arguments)
         zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-        return jax.lax.psum(jax.lax.scan(add, zero, numbers)[0], "pairs")
+        parts = numbers if by_pair else numbers.reshape(rounds, -1)
+        return jax.lax.psum(jax.lax.scan(add, zero, parts)[0], AXIS)
 
     total = jax.shard_map(
         local,
         mesh=mesh,
-        in_specs=(PartitionSpec("pairs"), *[PartitionSpec()] * len(arguments)),
+        in_specs=(PartitionSpec(AXIS), *[PartitionSpec()] * len(arguments)),
         out_specs=PartitionSpec(),
         # Checked, jax.grad inside would sum over the devices by itself, pair by pair.
         check_vma=False,
-    )(jnp.arange(rounds * mesh.size, dtype=jnp.int32), *arguments)
+    )(jnp.arange(each * mesh.size, dtype=jnp.int32), *arguments)
     return jax.tree.map(lambda value: value / count, total)
 
 
-def stack_over_devices(function: Callable[..., Any], count: int) -> Any:
+def stack_over_devices(mesh: Mesh, function: Callable[..., Any], count: int) -> Any:
     """``function(i)`` for i in 0..count-1, stacked, for what needs the whole batch at once.
 
-    On a CPU the XLA devices share the rows, and XLA divides what is computed from them the same
-    way; where the count is no multiple of the devices, each computes all of it.
+    The devices share the rows, and XLA divides what is computed from them the same way.
     """
     values = jax.vmap(function)(jnp.arange(count, dtype=jnp.int32))
-    if jax.default_backend() != "cpu" or count % jax.device_count():
-        return values
-    rows = NamedSharding(_cpu_mesh(), PartitionSpec("pairs"))
+    rows = NamedSharding(mesh, PartitionSpec(AXIS))
     return jax.tree.map(lambda value: jax.lax.with_sharding_constraint(value, rows), values)
-
-
-def _cpu_mesh() -> Mesh:
-    return jax.make_mesh((jax.device_count(),), ("pairs",), axis_types=(AxisType.Auto,))

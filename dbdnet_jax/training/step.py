@@ -9,6 +9,7 @@ import flax.struct
 import jax
 import jax.numpy as jnp
 import optax
+from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from dbdnet_jax.networks.batch_norm import fold, join_batch_stats
@@ -73,19 +74,30 @@ def train_step(
     loss: Callable[..., Any],
     optimizer: optax.GradientTransformation,
     batch_size: int,
+    mesh: Mesh,
     ema_decay: float = 0.0,
+    accumulate: int = 1,
+    remat: bool = False,
 ) -> tuple[TrainState, StepMetrics]:
     """One step on ``batch_size`` fresh pairs; pure, so its result depends on the arguments only.
 
-    ``loss`` is a task's (`training.task`). Where the loss, a term or the gradient is not finite the
-    state comes back as it was, step count included: the same step would be taken again, and fail
-    again, until the caller stops.
+    The devices of ``mesh`` share the pairs; on a GPU or TPU each takes its own in ``accumulate``
+    parts, one after another. ``remat`` recomputes the loss for its gradient. ``loss`` is a task's
+    (`training.task`). Where the loss, a term or the gradient is not finite the state comes back as
+    it was, step count included: the same step would be taken again, and fail again, until the
+    caller stops.
     """
     key = jax.random.fold_in(key, state.step)
-    differentiate = _by_pair if state.batch_stats is None else _by_batch
-    total, terms, gradient, batch_stats = differentiate(
-        state, frozen, key, arrays, draw, loss, batch_size
-    )
+    loss = jax.checkpoint(loss) if remat else loss
+    batch_stats = None
+    if state.batch_stats is None:
+        total, terms, gradient = _by_pair(
+            state, frozen, key, arrays, draw, loss, batch_size, mesh, accumulate
+        )
+    else:
+        total, terms, gradient, batch_stats = _by_batch(
+            state, frozen, key, arrays, draw, loss, batch_size, mesh
+        )
     norm = optax.tree.norm(gradient)
     finite = jnp.isfinite(jnp.stack([total, norm, *jax.tree.leaves(terms)])).all()
 
@@ -109,7 +121,9 @@ def _by_pair(
     draw: Draw,
     loss: Callable[..., Any],
     batch_size: int,
-) -> tuple[Array, Any, Any, Any]:
+    mesh: Mesh,
+    accumulate: int,
+) -> tuple[Array, Any, Any]:
     """Loss, terms and gradient as means over the pairs, each on its own."""
 
     def one(i: Array, params: Any, frozen: Any, step: Array, key: PRNGKeyArray, arrays: Any) -> Any:
@@ -118,9 +132,13 @@ def _by_pair(
         return jax.value_and_grad(loss, has_aux=True)(params, frozen, pair, loss_key)
 
     (total, terms), gradient = mean_over_pairs(
-        one, batch_size, state.params, frozen, state.step, key, arrays
+        mesh,
+        one,
+        batch_size,
+        *(state.params, frozen, state.step, key, arrays),
+        rounds=accumulate,
     )
-    return total, terms, gradient, None
+    return total, terms, gradient
 
 
 def _by_batch(
@@ -131,6 +149,7 @@ def _by_batch(
     draw: Draw,
     loss: Callable[..., Any],
     batch_size: int,
+    mesh: Mesh,
 ) -> tuple[Array, Any, Any, Any]:
     """Loss, terms and gradient of all pairs together, and the new running averages."""
 
@@ -138,7 +157,7 @@ def _by_batch(
         draw_key, _ = jax.random.split(jax.random.fold_in(key, i))
         return draw(draw_key, state.step * batch_size + i, arrays)
 
-    pairs = stack_over_devices(one, batch_size)
+    pairs = stack_over_devices(mesh, one, batch_size)
     loss_key = jax.random.fold_in(key, batch_size)
     (total, (terms, batch_stats)), gradient = jax.value_and_grad(loss, has_aux=True)(
         state.params, frozen, pairs, loss_key, state.batch_stats

@@ -75,7 +75,9 @@ class TrainConfig:
     validate_every: int = 1000
     checkpoint_every: int = 200
     validation_pairs: int = 200
-    devices: int = 0  # XLA devices on a CPU; 0: one for each core
+    devices: int = 0  # that share each batch; 0: all (on a CPU, of one for each core)
+    accumulate: int = 1  # parts of a device's share, taken one after another on a GPU or TPU
+    remat: bool = False  # recompute the loss for its gradient instead of keeping what it needs
 
     def __post_init__(self) -> None:
         """Refuse unknown choices, and cadences that do not fit: a resumed log must be unbroken."""
@@ -112,7 +114,8 @@ class TrainConfig:
             raise ValueError(
                 f"config.train.ema_decay must be in [0, 1); got {self.ema_decay}. Use 0 for none."
             )
-        for name in ("log_every", "validate_every", "checkpoint_every", "validation_pairs"):
+        cadences = "log_every", "validate_every", "checkpoint_every"
+        for name in (*cadences, "validation_pairs", "accumulate"):
             value = getattr(self, name)
             if value < 1:
                 raise ValueError(f"config.train.{name} must be at least 1; got {value}.")

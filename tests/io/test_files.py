@@ -1,12 +1,14 @@
 """Whole files, and a cache that is never needed."""
 
+import errno
 import os
 import warnings
+from pathlib import Path
 
 import pytest
 
 from dbdnet_jax.io import files
-from dbdnet_jax.io.files import cache_folder, require_writable, warn_without_cache
+from dbdnet_jax.io.files import cache_folder, machine_error, require_writable, warn_without_cache
 
 
 @pytest.fixture
@@ -113,3 +115,26 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path, monkeypatch):
 def test_a_name_of_full_length_is_written(tmp_path):
     files.write_atomic(tmp_path / ("n" * 255), b"x")
     assert (tmp_path / ("n" * 255)).read_bytes() == b"x"
+
+
+@pytest.mark.parametrize(
+    ("error", "number"),
+    [
+        (OSError(errno.ENOSPC, "full"), errno.ENOSPC),
+        (PermissionError(errno.EACCES, "no"), errno.EACCES),
+        (ValueError("Error writing: [OS error 28: ENOSPC No space left on device]"), errno.ENOSPC),
+        (MemoryError(), errno.ENOMEM),
+        (FileNotFoundError(errno.ENOENT, "gone"), None),
+        (ValueError("[OS error 2: ENOENT No such file]"), None),
+        (ValueError("not an NPZ"), None),
+    ],
+)
+def test_an_error_of_the_machine_is_told_from_one_of_the_file(error, number):
+    try:
+        try:
+            raise error
+        except Exception as cause:
+            raise RuntimeError("a library failed") from cause
+    except RuntimeError as caught:
+        found = machine_error(caught, Path("a/b"))
+    assert (found and (found.errno, found.filename)) == (number and (number, "a/b"))

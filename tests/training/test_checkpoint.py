@@ -1,6 +1,6 @@
 """Checkpoints come back bit for bit, or say which folder to delete."""
 
-import json
+import errno
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +9,7 @@ import optax
 import pytest
 
 from dbdnet_jax.errors import CheckpointError
-from dbdnet_jax.networks.dbdnet.config import ModelConfig
-from dbdnet_jax.training.checkpoint import Checkpoints, load_best, write_stage
+from dbdnet_jax.training.checkpoint import Checkpoints
 from dbdnet_jax.training.step import init_state
 from tests.conftest import EXACT, assert_close
 
@@ -71,14 +70,6 @@ def test_of_equal_errors_the_one_trained_longer_is_the_best(tmp_path):
         assert steps(tmp_path) == {1, 2} and checkpoints.best_step() == 2
 
 
-def test_what_an_older_release_did_not_write_has_its_default(tmp_path):
-    defaults = {"train": {"seed": 0, "schedule": "cosine"}, "joint": {"epochs": 1.0}}
-    write_stage(tmp_path / "overlap", {"train": {"seed": 3}})
-    write_stage(tmp_path / "overlap", {"train": {"seed": 3, "schedule": "cosine"}}, defaults)
-    with pytest.raises(CheckpointError, match="schedule = cosine, this configuration constant"):
-        write_stage(tmp_path / "overlap", {"train": {"seed": 3, "schedule": "constant"}}, defaults)
-
-
 def test_a_folder_left_by_a_kill_while_saving_is_no_checkpoint(tmp_path):
     with Checkpoints(tmp_path) as checkpoints:
         checkpoints.save(1, state(1))
@@ -102,63 +93,85 @@ def test_a_damaged_checkpoint_names_the_folder_to_delete(tmp_path, damage):
         path = folder / "state" / "manifest.ocdbt"
         path.unlink() if damage == "a missing file" else path.write_bytes(b"")
     with Checkpoints(tmp_path) as checkpoints:
-        with pytest.raises(CheckpointError, match=r"checkpoints/2 is damaged .* step 1, again"):
+        with pytest.raises(
+            CheckpointError, match=r"checkpoints/2 is damaged .* Delete what is named"
+        ):
             checkpoints.restore(2, state(0))
         assert_same(checkpoints.restore(1, state(0)), state(1))
 
 
-def test_unreadable_metrics_name_the_folder(tmp_path):
+def test_a_damaged_newest_checkpoint_is_set_aside(tmp_path):
+    with Checkpoints(tmp_path) as checkpoints:
+        checkpoints.save(1, state(1), window=[{"loss": 0.1}])
+        checkpoints.save(2, state(2))
+    for aside in ("damaged-2", "damaged-2-1"):
+        flip_a_bit(tmp_path / "checkpoints" / "2")
+        with Checkpoints(tmp_path) as checkpoints:
+            with pytest.warns(RuntimeWarning, match=f"2 is damaged .*checksum.* now .*{aside}, "):
+                step, found, window = checkpoints.resume(state(0))
+            assert step == checkpoints.latest_step() == 1 and window == [{"loss": 0.1}]
+            assert_same(found, state(1))
+            checkpoints.save(2, state(2))
+        assert (tmp_path / "checkpoints" / aside).is_dir()
+
+
+def test_where_all_checkpoints_are_damaged_all_are_named_and_kept(tmp_path):
+    with Checkpoints(tmp_path) as checkpoints:
+        assert checkpoints.resume(state(0)) is None
+        for step in (1, 2):
+            checkpoints.save(step, state(step))
+            flip_a_bit(tmp_path / "checkpoints" / str(step))
+        with pytest.raises(CheckpointError, match=r"/2 is damaged .*/1 is damaged .*Delete what"):
+            checkpoints.resume(state(0))
+    assert steps(tmp_path) == {1, 2}
+
+
+@pytest.mark.parametrize("content", ["{", '{"loss": 1}', "", "\0\0"])
+def test_unreadable_metrics_cost_their_checkpoint_only(tmp_path, content):
     with Checkpoints(tmp_path) as checkpoints:
         checkpoints.save(1, state(1), 0.5)
-    (tmp_path / "checkpoints" / "1" / "metrics" / "metrics").write_text("{")
-    with pytest.raises(CheckpointError, match="Delete that folder"):
-        Checkpoints(tmp_path)
+        checkpoints.save(2, state(2), 0.4)
+    (tmp_path / "checkpoints" / "2" / "metrics" / "metrics").write_text(content)
+    with pytest.raises(CheckpointError, match=r"checkpoints/2 is damaged \(its metrics"):
+        Checkpoints(tmp_path, read_only=True)
+    with pytest.warns(RuntimeWarning, match="damaged-2, which may be deleted"):
+        with Checkpoints(tmp_path) as checkpoints:
+            assert checkpoints.best_step() == checkpoints.latest_step() == 1
+    with Checkpoints(tmp_path) as checkpoints:  # and without a warning from then on
+        assert checkpoints.latest_step() == 1
 
 
-def test_a_stage_goes_on_only_with_its_own_configuration(tmp_path):
-    record = {"model": {"heads": 4}, "train": {"seed": 0}}
-    write_stage(tmp_path / "overlap", record)
-    write_stage(tmp_path / "overlap", record)
-    with pytest.raises(CheckpointError, match=r"model\.heads = 4, this configuration 2"):
-        write_stage(tmp_path / "overlap", {"model": {"heads": 2}, "train": {"seed": 0}})
+@pytest.mark.parametrize(
+    "failure",
+    [
+        OSError(errno.EMFILE, "Too many open files"),
+        ValueError("Error reading ... [OS error 13: EACCES Permission denied] [source ..."),
+        MemoryError(),
+    ],
+)
+def test_errors_of_the_machine_are_no_damage(tmp_path, monkeypatch, failure):
+    with Checkpoints(tmp_path) as checkpoints:
+        checkpoints.save(1, state(1))
+
+        def fail(*_, **__):
+            try:
+                raise failure
+            except Exception as error:
+                raise RuntimeError("a thread of a library failed") from error
+
+        monkeypatch.setattr(type(checkpoints._orbax), "load", fail)
+        with pytest.raises(OSError, match=r"Too many|Permission|memory.*checkpoints/1"):
+            checkpoints.resume(state(0))
+        monkeypatch.setattr(type(checkpoints._orbax), "save", fail)
+        with pytest.raises(OSError, match=r"Too many|Permission|memory"):
+            checkpoints.save(2, state(2))
+    assert steps(tmp_path) == {1}
 
 
-def save_run(run_dir, stage: str, config: dict, error: float | None, *, ema_decay: float = 0.0):
-    saved = state(3, ema_decay=ema_decay)
-    if ema_decay:
-        saved = saved.replace(ema=jax.tree.map(lambda leaf: leaf + 1, saved.params))
-    write_stage(run_dir / stage, {"model": config})
-    with Checkpoints(run_dir / stage) as checkpoints:
-        checkpoints.save(1, saved, error)
-        checkpoints.save(2, state(4), None)
-    return saved
-
-
-def test_load_best_takes_each_stage_and_prefers_the_average(tmp_path):
-    config = {"heads": 2, "released": True}
-    overlap = save_run(tmp_path, "overlap", config, 0.5)
-    params = load_best(tmp_path)
-    assert params.config == ModelConfig(heads=2, released=True) and params.registration is None
-    assert_same(params.overlap, overlap.params)
-    registration = save_run(tmp_path, "registration", config, 0.5, ema_decay=0.9)
-    assert_same(load_best(tmp_path).registration, registration.ema)
-
-
-def test_load_best_says_what_is_missing_or_wrong(tmp_path):
-    with pytest.raises(CheckpointError, match=r"has none. Train first"):
-        load_best(tmp_path)
-    save_run(tmp_path, "overlap", {}, None)
-    with pytest.raises(CheckpointError, match=r"has none. Train first"):
-        load_best(tmp_path)
-    save_run(tmp_path, "registration", {}, 0.5)
-    path = tmp_path / "registration" / "stage.json"
-    path.write_text(json.dumps({"model": {"no_such_field": 1}}))
-    with pytest.raises(CheckpointError, match="must be the fields of ModelConfig.*no_such_field"):
-        load_best(tmp_path)
-    path.write_text("{")
-    with pytest.raises(CheckpointError, match=r"readable stage\.json"):
-        load_best(tmp_path)
-    path.write_text(json.dumps({"model": {}}))
-    flip_a_bit(tmp_path / "registration" / "checkpoints" / "1")
-    with pytest.raises(CheckpointError, match="checkpoints/1 is damaged"):
-        load_best(tmp_path)
+def test_a_reader_leaves_what_a_training_is_writing(tmp_path):
+    with Checkpoints(tmp_path) as checkpoints:
+        checkpoints.save(1, state(1))
+    writing = tmp_path / "checkpoints" / "2.orbax-checkpoint-tmp"
+    writing.mkdir()
+    with Checkpoints(tmp_path, read_only=True) as checkpoints:
+        assert checkpoints.latest_step() == 1 and writing.is_dir()

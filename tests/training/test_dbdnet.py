@@ -13,10 +13,11 @@ from dbdnet_jax.data.training_pairs import PairStream, pairs_of_shapes
 from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import save_params
-from dbdnet_jax.training.checkpoint import Checkpoints, load_best, write_stage
+from dbdnet_jax.training.checkpoint import Checkpoints
 from dbdnet_jax.training.config import read_config, stage_record
 from dbdnet_jax.training.loop import fit
 from dbdnet_jax.training.losses import JointTerms
+from dbdnet_jax.training.run_folder import load_best, write_stage
 from dbdnet_jax.training.table import STAGES
 from dbdnet_jax.training.task import RunConfig, Task
 from tests import stand_in

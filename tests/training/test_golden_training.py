@@ -14,7 +14,7 @@ from dbdnet_jax.networks.dbdnet.released import to_released
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.training.config import read_config
 from dbdnet_jax.training.optimizer import make_optimizer
-from dbdnet_jax.training.parallel import on_all_devices
+from dbdnet_jax.training.parallel import on_all_devices, training_mesh
 from dbdnet_jax.training.step import init_state, train_step
 from dbdnet_jax.training.table import STAGES as TRAINED
 from tests.conftest import assert_close
@@ -55,6 +55,7 @@ def trained(stage: str, numbers: tuple[int, ...]) -> Trained:
         optax.trace(decay=0.0),  # keeps the gradient
         make_optimizer(optax.constant_schedule(1e-3), weight_decay=config.train.weight_decay),
     )
+    mesh = training_mesh(len(numbers))
     step = jax.jit(
         functools.partial(
             train_step,
@@ -62,10 +63,11 @@ def trained(stage: str, numbers: tuple[int, ...]) -> Trained:
             loss=task.loss,
             optimizer=optimizer,
             batch_size=len(numbers),
+            mesh=mesh,
         )
     )
-    state = on_all_devices(init_state(getattr(params, stage), optimizer))
-    key, arrays = on_all_devices((jax.random.key(0), pairs(*numbers)))
+    state = on_all_devices(mesh, init_state(getattr(params, stage), optimizer))
+    key, arrays = on_all_devices(mesh, (jax.random.key(0), pairs(*numbers)))
     states, metrics = [], []
     for _ in range(5):
         state, of_step = step(state, None, key, arrays)

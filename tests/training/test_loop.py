@@ -1,10 +1,8 @@
 """The step and the loop: the same result however often a run is stopped, and no bad state kept."""
 
-import os
+import dataclasses
+import functools
 import signal
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import jax
@@ -14,9 +12,10 @@ import optax
 import pytest
 
 from dbdnet_jax.training.checkpoint import Checkpoints
+from dbdnet_jax.training.lock import LOCK
 from dbdnet_jax.training.optimizer import make_optimizer, make_schedule
-from dbdnet_jax.training.parallel import mean_over_pairs, on_all_devices
-from dbdnet_jax.training.runlog import RunLog
+from dbdnet_jax.training.parallel import on_all_devices, training_mesh
+from dbdnet_jax.training.preemption import Preempted
 from dbdnet_jax.training.step import init_state, train_step
 from tests import stand_in
 from tests.conftest import EXACT, FLOAT32, assert_close, assert_finite
@@ -78,12 +77,17 @@ def test_the_rate_warms_up_over_epochs(unbroken):
     np.testing.assert_allclose(rows["learning_rate"], [schedule(i) for i in range(STEPS)])
 
 
+def written(folder: Path) -> dict[Path, int]:
+    """When each file was written, but for the lock, which says who looked last."""
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.name != LOCK}
+
+
 def test_two_runs_are_the_same_and_a_finished_one_stays(unbroken, tmp_path):
     stand_in.train(tmp_path)
     assert_same_run(tmp_path, unbroken)
-    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")}
+    before = written(tmp_path)
     stand_in.train(tmp_path)
-    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*")} == before
+    assert written(tmp_path) == before
 
 
 @pytest.mark.parametrize("stops", [(7,), (1, 3, 4, 11)])
@@ -103,20 +107,39 @@ def test_a_stopped_run_ends_as_an_unbroken_one(unbroken, tmp_path, stops):
     assert_same_run(tmp_path, unbroken)
 
 
-def test_a_run_killed_again_and_again_ends_as_an_unbroken_one(unbroken, tmp_path):
-    command = [sys.executable, "-m", "tests.stand_in", str(tmp_path)]
-    options = {"cwd": Path(__file__).parents[2], "env": {**os.environ, "JAX_PLATFORMS": "cpu"}}
-    log = tmp_path / "train.csv"
-    for rows in (3, 8):
-        child = subprocess.Popen([*command, "0.1"], stderr=subprocess.DEVNULL, **options)
-        deadline = time.monotonic() + 120
-        while not log.exists() or log.read_text().count("\n") < 1 + rows:
-            assert child.poll() is None and time.monotonic() < deadline
-            time.sleep(0.01)
-        child.send_signal(signal.SIGKILL)
-        assert child.wait() == -signal.SIGKILL
-    subprocess.run([*command, "0"], check=True, capture_output=True, timeout=120, **options)
-    assert_same_run(tmp_path, unbroken)
+def test_trained_networks_are_judged_once_before_the_first_step(tmp_path):
+    task = stand_in.task()._replace(networks=("matrix", "offset"))
+    pairs = stand_in.source()
+
+    def killed_at_once(start):
+        raise Stopped
+        yield
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stand_in, "task", lambda: task)
+        for _ in range(2):
+            with pytest.raises(Stopped):
+                stand_in.train(tmp_path, pairs._replace(arrays=killed_at_once))
+        stand_in.train(tmp_path)
+    rows = np.genfromtxt(tmp_path / "validation.csv", delimiter=",", names=True)
+    assert list(rows["step"]) == [0, 4, 8, 12]
+
+
+def test_a_signal_within_a_row_of_the_log_leaves_no_trace(tmp_path):
+    config = dataclasses.replace(stand_in.TRAIN, log_every=4, checkpoint_every=4)
+    stand_in.train(tmp_path / "unbroken", config=config)
+    pairs = stand_in.source()
+
+    def arrays(start):
+        for step, these in enumerate(pairs.arrays(start), start=start):
+            if step == 5:
+                signal.raise_signal(signal.SIGTERM)
+            yield these
+
+    with pytest.raises(Preempted, match="SIGTERM; the state after step 6 of 12 is saved in"):
+        stand_in.train(tmp_path / "stopped", pairs._replace(arrays=arrays), config)
+    stand_in.train(tmp_path / "stopped", config=config)
+    assert_same_run(tmp_path / "stopped", tmp_path / "unbroken")
 
 
 def broken_source(bad: int):
@@ -184,10 +207,12 @@ def step_once(batch_size: int, ema_decay: float = 0.0, bad: int = -1):
             loss=task.loss,
             optimizer=optimizer,
             batch_size=batch_size,
+            mesh=mesh,
             ema_decay=ema_decay,
         )
 
-    return state, *step(*on_all_devices(arguments))
+    mesh = training_mesh(batch_size)
+    return state, *step(*on_all_devices(mesh, arguments))
 
 
 @pytest.mark.parametrize("batch_size", [1, 4, 5])
@@ -220,41 +245,36 @@ def test_a_bad_step_changes_nothing():
     jax.tree.map(lambda a, b: assert_close(a, b, EXACT), new, state)
 
 
+def test_recomputation_is_a_part_of_the_step_where_it_is_asked_for():
+    pairs, task, optimizer = stand_in.source(), stand_in.task(), optax.sgd(1.0)
+    state, mesh = init_state(task.trainable, optimizer), training_mesh(4)
+    options = {"draw": pairs.draw, "loss": task.loss, "optimizer": optimizer, "mesh": mesh}
+    rest = None, jax.random.key(0), next(pairs.arrays(0))
+
+    def text(remat):
+        step = functools.partial(train_step, batch_size=4, remat=remat, **options)
+        return str(jax.make_jaxpr(step)(state, *rest))
+
+    assert "remat" in text(True) or "checkpoint" in text(True)
+    assert "remat" not in text(False) and "checkpoint" not in text(False)
+
+
+def test_parts_that_cannot_be_are_refused(tmp_path):
+    with pytest.raises(ValueError, match="must divide .* got 3 for 2. Use 1"):
+        stand_in.train(tmp_path, config=dataclasses.replace(stand_in.TRAIN, accumulate=3))
+    batch_norms = stand_in.task()._replace(batch_stats={"mean": jnp.zeros(3)})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stand_in, "task", lambda: batch_norms)
+        with pytest.raises(ValueError, match="must be 1 for a network with batch norms.*got 2"):
+            stand_in.train(tmp_path, config=dataclasses.replace(stand_in.TRAIN, accumulate=2))
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_average_has_a_short_memory_at_first():
     state, new, _ = step_once(4, ema_decay=0.999)
     decay = (1 + 3) / (10 + 3)
     expected = jax.tree.map(lambda a, b: decay * a + (1 - decay) * b, state.ema, new.params)
     jax.tree.map(lambda a, b: assert_close(a, b, FLOAT32), new.ema, expected)
-
-
-@pytest.mark.parametrize("backend", ["cpu", "gpu"])
-@pytest.mark.parametrize("count", [1, 2, 3, 8])
-def test_mean_over_pairs_is_the_mean_on_any_hardware(monkeypatch, backend, count):
-    monkeypatch.setattr(jax, "default_backend", lambda: backend)
-    offset = jnp.asarray([0.5, -1.0])
-
-    def function(i, offset):
-        return {"a": jnp.sin(i.astype(float)) + offset, "b": jnp.where(i < count, 1.0, jnp.nan)}
-
-    found = jax.jit(lambda offset: mean_over_pairs(function, count, offset))(offset)
-    expected = np.mean([np.sin(i) + np.asarray(offset) for i in range(count)], axis=0)
-    assert_close(found["a"], expected, FLOAT32)
-    assert_close(found["b"], 1.0, EXACT)
-
-
-def test_the_log_drops_what_is_done_again_and_torn_rows(tmp_path):
-    with RunLog(tmp_path, 0) as log:
-        for step in (10, 20, 30):
-            log.write("train", step, {"loss": 1 / step, "rate": 0.1})
-        log.write("validation", 30, {"error": 0.5})
-    whole = (tmp_path / "train.csv").read_text()
-    with (tmp_path / "train.csv").open("a") as file:
-        file.write("4")
-    with RunLog(tmp_path, 20) as log:
-        assert (tmp_path / "train.csv").read_text() == whole[: whole.index("30,")]
-        assert not (tmp_path / "validation.csv").exists()
-        log.write("train", 30, {"loss": 1 / 30, "rate": 0.1})
-    assert (tmp_path / "train.csv").read_text() == whole
 
 
 def test_the_rate_may_stay_until_the_last_steps():

@@ -18,10 +18,11 @@ from dbdnet_jax.io.safe_pickle import CheckpointError
 from dbdnet_jax.networks.initial import init_params
 from dbdnet_jax.networks.masknet.network import predict
 from dbdnet_jax.networks.weights import load_params, save_params
-from dbdnet_jax.training.checkpoint import Checkpoints, load_best
+from dbdnet_jax.training.checkpoint import Checkpoints
 from dbdnet_jax.training.config import read_config
 from dbdnet_jax.training.loop import fit
 from dbdnet_jax.training.masknet import masknet_task
+from dbdnet_jax.training.run_folder import load_best
 from dbdnet_jax.types import Pair
 from tests import stand_in
 from tests.conftest import EXACT, assert_close
