@@ -73,7 +73,7 @@ def test_the_mirrored_pose_is_found_from_every_answer(seed):
 
 
 @pytest.mark.parametrize(("flip", "told"), [([1, 1, 1], False), ([-1, 1, 1], True)])
-@pytest.mark.parametrize("seed", [6, 8, 10])
+@pytest.mark.parametrize("seed", [6, 10])
 def test_a_small_part_tells_a_mirrored_chair(seed, flip, told):
     scene = drawn(chair, flip, seed, count=2600)
     options = {"refine": True, "guess": None, "proposals": []}

@@ -20,7 +20,7 @@ from dbdnet_jax.training.losses import JointTerms
 from dbdnet_jax.training.run_folder import load_best, write_stage
 from dbdnet_jax.training.table import STAGES
 from dbdnet_jax.training.task import RunConfig, Task
-from tests import stand_in
+from tests import stand_in, stand_in_train
 from tests.conftest import EXACT, Tolerance, assert_close, assert_finite
 
 
@@ -145,7 +145,9 @@ def test_weights_that_see_coordinates_only_go_on_with_local_geometry(run_dir, tm
     assert not kernel[3:19].any() and not kernel[22:].any()
 
 
-def test_a_constant_rate_lets_a_run_be_prolonged(tmp_path):
+def test_a_constant_rate_lets_a_run_be_prolonged(tmp_path, monkeypatch):
+    quick = STAGES["dbdnet"]["overlap"]._replace(make_task=stand_in_train.task)
+    monkeypatch.setitem(STAGES["dbdnet"], "overlap", quick)
     train = dataclasses.replace(CONFIG.train, schedule="constant", decay_epochs=1.0)
     settings = dataclasses.replace(CONFIG, train=train)
     longer = settings.with_stage("overlap", epochs=4.0)

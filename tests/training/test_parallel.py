@@ -78,7 +78,7 @@ def test_the_mesh_is_what_is_asked_for_or_an_error_that_says_what_fits(monkeypat
     assert training_mesh(3).size == training_mesh(3, 1).size == 1  # a CPU's devices cost nothing
     with pytest.raises(ValueError, match=r"by the 2 devices .* of 3\. .*of 2 or 4 .*=1"):
         training_mesh(3, 2)
-    with pytest.raises(ValueError, match="got 3 of 2. Use 0"):
+    with pytest.raises(ValueError, match=r"at most the 2 devices .* got 3\. Use 0"):
         training_mesh(3, 3)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     with pytest.raises(ValueError, match=r"a batch_size of 1\. Use a batch_size of 2 \(any"):
@@ -105,15 +105,15 @@ def curve(folder: Path, name: str = "train") -> np.ndarray:
 
 @pytest.mark.parametrize("backend", ["cpu", "gpu"])
 def test_devices_parts_and_recomputation_change_rounding_only(tmp_path, backend):
-    """A run moved from 8 devices to 2 and to 1 too, each of which goes on from the checkpoints."""
-    runs = [(tmp_path / str(devices), 12.0, {"devices": devices}) for devices in (1, 2, 8)]
+    """One run is moved from 8 devices to 2 and to 1, each of which goes on from the checkpoints."""
+    runs = [(tmp_path / "1", 12.0, {"devices": 1})]
     moves = ((8, 4.0), (2, 8.0), (1, 12.0))
     runs += [(tmp_path / "moved", epochs, {"devices": devices}) for devices, epochs in moves]
     runs += [(tmp_path / "parts", 12.0, {"devices": 2, "accumulate": 4, "remat": True})]
     trained(backend, runs)
     for name in ("train", "validation"):
         expected = curve(tmp_path / "1", name)
-        for other in ("2", "8", "moved", "parts"):
+        for other in ("moved", "parts"):
             assert_close(curve(tmp_path / other, name), expected, FLOAT32)
 
 

@@ -21,7 +21,7 @@ def in_the_repository(monkeypatch):
 
 
 def test_kills_at_random_moments_change_nothing(tmp_path):
-    assert differences(STAND_IN, tmp_path, kills=3, seed=1) == []
+    assert differences(STAND_IN, tmp_path, kills=2, seed=1) == []
 
 
 def test_a_closed_terminal_saves_and_a_second_training_is_refused(tmp_path):
