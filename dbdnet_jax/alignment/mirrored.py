@@ -20,8 +20,8 @@ from dbdnet_jax.ops.transforms import finer_cube_rotations, move
 # Logarithms of odds, added up from three measures. On 32 pairs of asymmetric chairs of boxes that
 # were aligned well it came to at most -0.4, and on 26 whose source was mirrored, to at least 0.23.
 # On 34 of `tools/scan_pairs` it came to up to 1.13: of things with a plane of symmetry that overlap
-# little, the mirrored source may cover more. So what lies between is a warning.
-MIRRORED, PERHAPS = 1.2, 0.2
+# little, the mirrored source may cover more. So all but far more than that is a warning only.
+MIRRORED, PERHAPS = 3.0, 0.2
 PER_RMSE = 8.0  # for each part by which the truncated RMSE is lower
 FEW = 3  # added to both numbers of matches: of few, the ratio tells little
 KEPT = 8  # of the coarsely refined poses
