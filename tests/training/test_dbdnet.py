@@ -109,6 +109,7 @@ def test_a_stopped_second_stage_ends_as_an_unbroken_one(run_dir, tmp_path):
         assert (tmp_path / name).read_bytes() == (run_dir / name).read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stage", ["overlap", "registration"])
 def test_networks_of_several_passes_go_on_from_weights(run_dir, tmp_path, stage):
     weights = tmp_path / "weights.npz"
@@ -183,6 +184,7 @@ def test_a_shape_with_nan_stops_the_overlap_stage(tmp_path):
         fit(CONFIG, "overlap", tmp_path, pairs._replace(arrays=lambda _: itertools.repeat(points)))
 
 
+@pytest.mark.slow
 def test_the_joint_stage_trains_both_networks_further(run_dir, tmp_path):
     weights = tmp_path / "weights.npz"
     save_params(weights, load_best(run_dir))

@@ -123,6 +123,7 @@ def free_port() -> int:
         return listener.getsockname()[1]
 
 
+@pytest.mark.slow
 def test_two_processes_train_as_one_stop_together_and_one_goes_on(tmp_path):
     command = [*STAND_IN, "--config.overlap.batch_size=4", "--config.overlap.epochs=0.25"]
     whole, shared = (f"--run_dir={tmp_path / name}" for name in ("whole", "shared"))

@@ -20,6 +20,7 @@ def in_the_repository(monkeypatch):
     monkeypatch.chdir(ROOT)
 
 
+@pytest.mark.slow
 def test_kills_at_random_moments_change_nothing(tmp_path):
     assert differences(STAND_IN, tmp_path, kills=2, seed=1) == []
 
