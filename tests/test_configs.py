@@ -229,6 +229,13 @@ def test_a_network_of_nothing_is_refused_by_its_field(field):
         read_config(with_change(**{f"model__{field}": 0}))
 
 
+def test_only_the_released_network_iterates():
+    with pytest.raises(
+        ValueError, match=r"iterations must be 1 unless released=True.*got 2\. Use 1"
+    ):
+        read_config(with_change(model__iterations=2))
+
+
 def test_a_missing_section_is_named_and_a_missing_field_has_its_default():
     config = with_change()
     with config.unlocked():

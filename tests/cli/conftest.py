@@ -1,5 +1,6 @@
 """The command in a folder with two clouds and the weights of a tiny network."""
 
+import sys
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -42,3 +43,16 @@ def run(folder, capsys, monkeypatch):
         return status, *capsys.readouterr()
 
     return run
+
+
+@pytest.fixture
+def reader_gone(monkeypatch):
+    """Nobody reads standard output any more."""
+
+    def gone(*words, file, show=print):
+        if file is sys.stdout:
+            raise BrokenPipeError(32, "Broken pipe")
+        show(*words, file=file)
+
+    monkeypatch.setattr("builtins.print", gone)
+    monkeypatch.setattr("dbdnet_jax.io.terminal._mute_stdout", lambda: None)  # it is the tests' own

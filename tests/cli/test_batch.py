@@ -159,14 +159,7 @@ def test_a_bar_with_rate_and_remaining_time_is_for_terminals(batch, monkeypatch)
     assert "3/3" in err and "pair/s" in err and "a1 -> t" not in err
 
 
-def test_a_batch_whose_output_nobody_reads_ends_quietly(batch, monkeypatch):
-    def gone(*words, file, show=print):
-        if file is sys.stdout:
-            raise BrokenPipeError(32, "Broken pipe")
-        show(*words, file=file)
-
-    monkeypatch.setattr("builtins.print", gone)
-    monkeypatch.setattr("dbdnet_jax.io.terminal._mute_stdout", lambda: None)  # it is the tests' own
+def test_a_batch_whose_output_nobody_reads_ends_quietly(batch, reader_gone):
     assert batch("a1 a2", "--jobs", "1")[0] == UNREAD
 
 

@@ -107,14 +107,7 @@ def test_a_warning_is_a_line(run, monkeypatch):
     assert run("a.ply", "b.ply")[2] == "warning: odd\\x1b\na.ply -> b.ply ...\n"
 
 
-def test_a_reader_that_is_gone_ends_it_quietly(run, monkeypatch):
-    def gone(*words, file, show=print):
-        if file is sys.stdout:
-            raise BrokenPipeError(32, "Broken pipe")
-        show(*words, file=file)
-
-    monkeypatch.setattr("builtins.print", gone)
-    monkeypatch.setattr("dbdnet_jax.io.terminal._mute_stdout", lambda: None)  # it is the tests' own
+def test_a_reader_that_is_gone_ends_it_quietly(run, reader_gone):
     status, _, err = run("a.ply", "b.ply")
     assert status == UNREAD and err == "a.ply -> b.ply ...\n"
 

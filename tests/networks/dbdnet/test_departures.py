@@ -85,9 +85,13 @@ def test_solves_coordinates_and_iterations(released, iterations, monkeypatch, x6
     monkeypatch.setattr(solving, "RegistrationNetwork", StandIn)
     monkeypatch.setattr(StandIn, "encoded", [])
     config = dataclasses.replace(SMALL, released=released)
+    if released:  # its configuration says how often, and nothing else
+        config = dataclasses.replace(config, iterations=iterations)
     params = Params({"registration": {}}, config)
     solve = jax.jit(register_given_overlap, static_argnames="solves")
-    answer = solve(params, whole(SOURCE), whole(TARGET), *MASKS, solves=iterations)
+    answer = solve(
+        params, whole(SOURCE), whole(TARGET), *MASKS, solves=None if released else iterations
+    )
     assert answer.valid
     last, composed, soft = registered(released, iterations)
     found = oracle.homogeneous(answer.rotation, answer.translation)
