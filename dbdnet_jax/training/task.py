@@ -118,7 +118,9 @@ class TrainConfig:
         for name in (*cadences, "validation_pairs", "accumulate"):
             value = getattr(self, name)
             if value < 1:
-                raise ValueError(f"config.train.{name} must be at least 1; got {value}.")
+                raise ValueError(
+                    f"config.train.{name} must be at least 1; got {value}. Use 1 or more."
+                )
             if name.endswith("_every") and value % self.log_every:
                 raise ValueError(
                     f"config.train.{name} must be a multiple of config.train.log_every = "
