@@ -20,6 +20,10 @@ def check_output(path: Path, endings: tuple[str, ...]) -> None:
         )
     if path.is_dir():
         raise IsADirectoryError(f"an output must be a file; {path} is a folder. Name a file in it.")
+    if path.parent.exists() and not path.parent.is_dir():
+        raise NotADirectoryError(
+            f"the folder of an output must be a folder; {path.parent} is a file. Name another."
+        )
     if not path.parent.is_dir():
         raise FileNotFoundError(
             f"the folder of an output must exist; {path.parent} does not. Create it."

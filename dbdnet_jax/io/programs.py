@@ -59,10 +59,11 @@ def require_device() -> None:
     try:
         jax.devices()
     except Exception as error:  # which one depends on the platform: an AssertionError for CUDA
-        said = " ".join(repr(error).split())[:300]
+        said = " ".join(str(error).split())[:300]
         raise ValueError(
             "JAX_PLATFORMS must name platforms that this machine has; got "
-            f"{jax.config.values['jax_platforms']!r} ({said}). Unset it, or use JAX_PLATFORMS=cpu."
+            f"{jax.config.values['jax_platforms']!r}{said and f' ({said})'}. Unset it, or use "
+            "JAX_PLATFORMS=cpu."
         ) from error
 
 

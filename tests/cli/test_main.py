@@ -181,6 +181,7 @@ def test_a_page_and_a_picture_are_written(run, tmp_path):
         ("--report", "page.pdf", "must be one of .html; got page.pdf"),
         ("--png", "picture.jpg", "must be one of .png; got picture.jpg"),
         ("--report", "missing/page.html", "the folder of an output must exist"),
+        ("--report", "a.ply/page.html", "the folder of an output must be a folder; a.ply is a"),
     ],
 )
 def test_an_output_that_cannot_be_is_refused_before_any_work(
