@@ -6,10 +6,13 @@ Weights to share are another matter: see `dbdnet_jax.networks.weights`.
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import json
+import logging
 import warnings
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -59,11 +62,12 @@ class Checkpoints:
             raise CheckpointError(_advice(damaged))
         _set_aside(damaged)
         try:
-            self._orbax = ocp.training.Checkpointer(
-                self.folder,
-                preservation_policy=keep.AnyPreservationPolicy([keep.LatestN(KEPT), best]),
-                cleanup_tmp_directories=not read_only,
-            )
+            with _logs_silenced():
+                self._orbax = ocp.training.Checkpointer(
+                    self.folder,
+                    preservation_policy=keep.AnyPreservationPolicy([keep.LatestN(KEPT), best]),
+                    cleanup_tmp_directories=not read_only,
+                )
         except Exception as error:  # Orbax raises many kinds; none of them says what to do
             raise machine_error(error, self.folder) or CheckpointError(
                 f"checkpoints must be readable; those in {self.folder} are not "
@@ -164,6 +168,13 @@ class Checkpoints:
 
     def _read(self, step: int, like: Any) -> tuple[Any, str]:
         """The state of ``step``, and what is wrong with it ("": nothing)."""
+        with _logs_silenced():
+            state, damage = self._attempt(step, like)
+            if damage:
+                gc.collect()  # asyncio's tasks that failed say so when they are collected
+        return state, damage
+
+    def _attempt(self, step: int, like: Any) -> tuple[Any, str]:
         try:
             written = self._orbax.metadata(step).custom_metadata["crc32"]
             state = self._orbax.load(step, like)
@@ -189,6 +200,17 @@ class Checkpoints:
             except (ValueError, KeyError, TypeError) as error:
                 found[checkpoint] = f"its metrics: {first_line(error)}"
         return found
+
+
+@contextlib.contextmanager
+def _logs_silenced() -> Iterator[None]:
+    """Of a damaged file libraries log pages; what counts is in the error."""
+    before = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logging.disable(before)
 
 
 def _set_aside(damaged: dict[Path, str]) -> None:

@@ -1,6 +1,7 @@
 """Checkpoints come back bit for bit, or say which folder to delete."""
 
 import errno
+import gc
 
 import jax
 import jax.numpy as jnp
@@ -81,23 +82,28 @@ def test_a_folder_left_by_a_kill_while_saving_is_no_checkpoint(tmp_path):
         assert_same(checkpoints.restore(2, state(0)), state(2))
 
 
-@pytest.mark.parametrize("damage", ["a flipped bit", "an empty file", "a missing file"])
-def test_a_damaged_checkpoint_names_the_folder_to_delete(tmp_path, damage):
+@pytest.mark.parametrize("damage", ["a flipped bit", "half a file", "an empty file", "no file"])
+def test_a_damaged_checkpoint_names_the_folder_to_delete(tmp_path, caplog, damage):
     with Checkpoints(tmp_path) as checkpoints:
         checkpoints.save(1, state(1))
         checkpoints.save(2, state(2))
     folder = tmp_path / "checkpoints" / "2"
     if damage == "a flipped bit":
         flip_a_bit(folder)
+    elif damage == "half a file":
+        path = max((folder / "state" / "d").iterdir(), key=lambda path: path.stat().st_size)
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     else:
         path = folder / "state" / "manifest.ocdbt"
-        path.unlink() if damage == "a missing file" else path.write_bytes(b"")
+        path.unlink() if damage == "no file" else path.write_bytes(b"")
     with Checkpoints(tmp_path) as checkpoints:
         with pytest.raises(
             CheckpointError, match=r"checkpoints/2 is damaged .* Delete what is named"
         ):
             checkpoints.restore(2, state(0))
         assert_same(checkpoints.restore(1, state(0)), state(1))
+    gc.collect()
+    assert not caplog.records  # libraries log pages
 
 
 def test_a_damaged_newest_checkpoint_is_set_aside(tmp_path):
