@@ -8,12 +8,13 @@
     python -m benchmarks.attacks --part=pickles --count=571
     python -m benchmarks.attacks --part=checkpoints --count=70
 
-``outliers`` and ``mirrored`` spoil pairs of validation shapes that no turn brings onto themselves:
-each row tells how many answers are right (5 degrees), valid, and both valid and wrong. ``threads``
-aligns one pair in so many threads at once, ``points`` one of so many points; ``programs`` damages
-kept programs between alignments in new processes, ``pickles`` and ``checkpoints`` change, cut or
-lengthen files at random: each must be read or refused in words, within a minute. Ends with status 1
-where one of these is not so, or where a valid answer is wrong in more than one of fifty.
+``outliers`` spoils pairs of validation shapes that no turn brings onto themselves, ``mirrored``
+those of generated solids that a mirror shows otherwise: a row tells how many answers are right (5
+degrees), valid, and both valid and wrong. ``threads`` aligns one pair in so many threads at once,
+``points`` one of so many points; ``programs`` damages kept programs between alignments in new
+processes, ``pickles`` and ``checkpoints`` change, cut or lengthen files at random: each must be
+read or refused in words, within a minute. Ends with status 1 where one of these is not so, or where
+a valid answer is wrong in more than one of fifty.
 """
 
 from __future__ import annotations
@@ -37,11 +38,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 import dbdnet_jax
 from benchmarks.machine import peak_gib
 from dbdnet_jax import align
 from dbdnet_jax.data.cad import cad_split
+from dbdnet_jax.data.procedural.shapes import procedural_shapes
 from dbdnet_jax.data.symmetry import symmetric_shapes
 from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.io.programs import keep_compiled_programs
@@ -58,6 +62,9 @@ KEPT = 0.7  # part of each cloud beyond a plane of its own
 LONGEST_S = 60.0  # to read or refuse one small file
 TOLERATED = 0.02  # part of the valid answers that may be wrong
 
+HANDED_SEED = 4001  # no seed of a training's
+QUERIES, UNLIKE = 512, 2.0  # points that are reflected; their mean distance per spacing
+
 Spoil = Callable[[Points, np.random.Generator], Points]
 
 
@@ -69,9 +76,16 @@ class Drawn(NamedTuple):
     target_from_source: Transform
 
 
-def drawn_pairs(count: int) -> Iterator[tuple[Drawn, np.random.Generator]]:
-    """Pairs of validation shapes in turn, and what draws the rest of each."""
-    shapes = cad_split("val").points.astype(np.float64)
+def drawn_pairs(count: int, *, handed: bool = False) -> Iterator[tuple[Drawn, np.random.Generator]]:
+    """Pairs of validation shapes in turn, and what draws the rest of each.
+
+    Where ``handed``, of generated solids that a mirror shows otherwise.
+    """
+    if handed:
+        shapes = procedural_shapes(4 * count, seed=HANDED_SEED).points.astype(np.float64)
+        shapes = shapes[[is_handed(shape) for shape in shapes]]
+    else:
+        shapes = cad_split("val").points.astype(np.float64)
     shapes = shapes[~symmetric_shapes(shapes)]
     for number in range(count):
         rng = np.random.default_rng((2026, number))
@@ -85,9 +99,17 @@ def drawn_pairs(count: int) -> Iterator[tuple[Drawn, np.random.Generator]]:
         yield Drawn(clouds[0], move(motion, clouds[1]), motion), rng
 
 
-def _motion(axis: np.ndarray, translation: np.ndarray) -> Transform:
-    from scipy.spatial.transform import Rotation
+def is_handed(points: Points) -> bool:
+    """Whether no reflection at a coordinate or principal plane brings a shape onto itself."""
+    centred = points - points.mean(axis=0)
+    tree, some = cKDTree(centred), centred[:QUERIES]
+    spacing = tree.query(some, k=2)[0][:, 1].mean()
+    axes = np.concatenate([np.eye(3), np.linalg.eigh(np.cov(centred.T))[1].T])
+    reflected = [some - 2 * np.outer(some @ axis, axis) for axis in axes]
+    return min(tree.query(each)[0].mean() for each in reflected) > UNLIKE * spacing
 
+
+def _motion(axis: np.ndarray, translation: np.ndarray) -> Transform:
     turn = Rotation.from_rotvec(TURNED_DEG * axis, degrees=True)
     return transform_of(turn.as_matrix(), translation)
 
@@ -150,7 +172,7 @@ def judge_answers(kinds: dict[str, Spoil], count: int, *, both: bool = True) -> 
     wrong = valid = 0
     for name, spoil in kinds.items():
         rows = []
-        for pair, rng in drawn_pairs(count):
+        for pair, rng in drawn_pairs(count, handed=not both):
             target = spoil(pair.target, rng) if both else pair.target
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
