@@ -80,6 +80,7 @@ def training_step(
         ema_decay=train.ema_decay,
         accumulate=train.accumulate,
         remat=train.remat,
+        precision=train.precision,
     )
     state = on_all_devices(mesh, init_state(task.trainable, optimizer, ema_decay=train.ema_decay))
     # All four, so that the program may be called with what it was compiled for.

@@ -112,6 +112,7 @@ def run_task(
             ema_decay=train.ema_decay,
             accumulate=train.accumulate,
             remat=train.remat,
+            precision=train.precision,
         )
         with RunLog(folder, start) as log:
             loop = _Loop(task, stream, train, checkpoints, log, schedule, batch_size, total, mesh)

@@ -13,6 +13,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from dbdnet_jax.networks.batch_norm import fold, join_batch_stats
+from dbdnet_jax.networks.params import bfloat16_kernels
 from dbdnet_jax.training.parallel import mean_over_pairs, stack_over_devices
 from dbdnet_jax.types import Pair
 
@@ -78,16 +79,18 @@ def train_step(
     ema_decay: float = 0.0,
     accumulate: int = 1,
     remat: bool = False,
+    precision: str = "float32",
 ) -> tuple[TrainState, StepMetrics]:
     """One step on ``batch_size`` fresh pairs; pure, so its result depends on the arguments only.
 
     The devices of ``mesh`` share the pairs; on a GPU or TPU each takes its own in ``accumulate``
-    parts, one after another. ``remat`` recomputes the loss for its gradient. ``loss`` is a task's
-    (`training.task`). Where the loss, a term or the gradient is not finite the state comes back as
-    it was, step count included: the same step would be taken again, and fail again, until the
-    caller stops.
+    parts, one after another. ``remat`` recomputes the loss for its gradient; a ``precision`` of
+    "bfloat16" is that of its products. ``loss`` is a task's (`training.task`). Where the loss, a
+    term or the gradient is not finite the state comes back as it was, step count included: the same
+    step would be taken again, and fail again, until the caller stops.
     """
     key = jax.random.fold_in(key, state.step)
+    loss = _with_bfloat16(loss) if precision == "bfloat16" else loss
     loss = jax.checkpoint(loss) if remat else loss
     batch_stats = None
     if state.batch_stats is None:
@@ -111,6 +114,15 @@ def train_step(
     moved = TrainState(state.step + 1, params, opt_state, ema, batch_stats)
     state = jax.tree.map(lambda new, old: jnp.where(finite, new, old), moved, state)
     return state, StepMetrics(total, terms, norm, finite)
+
+
+def _with_bfloat16(loss: Callable[..., Any]) -> Callable[..., Any]:
+    """The loss of rounded kernels; its gradient is one of the kernels as they are."""
+
+    def rounded(trainable: Any, frozen: Any, *rest: Any) -> Any:
+        return loss(bfloat16_kernels(trainable), bfloat16_kernels(frozen), *rest)
+
+    return rounded
 
 
 def _by_pair(
