@@ -9,16 +9,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental import multihost_utils
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Int
 
 AXIS = "pairs"
+AT_ONCE = 16  # answers of a GPU or TPU; the memory of a larger number may be lacking
 
 
 def join_processes(
     coordinator: str | None = None, processes: int | None = None, process_id: int | None = None
 ) -> None:
-    """Make this one of several processes that train together, before JAX has made any device.
+    """Make this one of several processes that work together, before JAX has made any device.
 
     ``coordinator`` is the HOST:PORT of process 0. What is None is taken from the scheduler's
     environment, as `jax.distributed.initialize` knows it: Slurm, Open MPI, a TPU pod.
@@ -30,7 +32,7 @@ def join_processes(
         jax.distributed.initialize(coordinator, processes, process_id)
     except (ValueError, RuntimeError) as error:
         raise ValueError(
-            "processes that train together must know and reach each other; got --coordinator="
+            "processes that work together must know and reach each other; got --coordinator="
             f"{coordinator}, --processes={processes}, --process_id={process_id} "
             f"({str(error).splitlines()[0][:200]}). Give all three, or start them by a scheduler."
         ) from error
@@ -46,11 +48,7 @@ def training_mesh(batch_size: int, devices: int = 0) -> Mesh:
         ValueError: there are fewer, or they cannot share the batch; says what would fit.
     """
     processes, there = jax.process_count(), jax.device_count()
-    if devices > there or devices % processes:
-        raise ValueError(
-            f"config.train.devices must be at most the {there} devices there are, and as many in "
-            f"each of the {processes} processes; got {devices}. Use 0 for all."
-        )
+    _require_devices(devices)
     if not devices and jax.default_backend() == "cpu":
         shares = range(processes, there + 1, processes)
         devices = max((n for n in shares if batch_size % n == 0), default=there)
@@ -66,6 +64,26 @@ def training_mesh(batch_size: int, devices: int = 0) -> Mesh:
     found = sorted(jax.devices(), key=lambda device: (device.process_index, device.id))
     of_each = np.asarray(found).reshape(processes, -1)[:, : size // processes]
     return Mesh(of_each.reshape(-1), (AXIS,), axis_types=(AxisType.Auto,))
+
+
+def local_mesh(devices: int = 0) -> Mesh:
+    """This process's own part of ``devices``, for work that needs no other process; 0: all it has.
+
+    Raises:
+        ValueError: there are fewer.
+    """
+    _require_devices(devices)
+    own = jax.local_devices()[: devices // jax.process_count() or None]
+    return Mesh(np.asarray(own), (AXIS,), axis_types=(AxisType.Auto,))
+
+
+def _require_devices(devices: int) -> None:
+    processes, there = jax.process_count(), jax.device_count()
+    if devices > there or devices % processes:
+        raise ValueError(
+            f"config.train.devices must be at most the {there} devices there are, and as many in "
+            f"each of the {processes} processes; got {devices}. Use 0 for all."
+        )
 
 
 def on_all_devices(mesh: Mesh, tree: Any) -> Any:
@@ -132,3 +150,52 @@ def stack_over_devices(mesh: Mesh, function: Callable[..., Any], count: int) -> 
     values = jax.vmap(function)(jnp.arange(count, dtype=jnp.int32))
     rows = NamedSharding(mesh, PartitionSpec(AXIS))
     return jax.tree.map(lambda value: jax.lax.with_sharding_constraint(value, rows), values)
+
+
+def map_over_pairs(mesh: Mesh, function: Callable[..., Any], pairs: Any, *arguments: Any) -> Any:
+    """``function(pair, *arguments)`` of each of stacked pairs, stacked, as NumPy arrays.
+
+    The devices of a `local_mesh` share the pairs, whatever their number.
+    """
+    count = len(jax.tree.leaves(pairs)[0])
+    each = math.ceil(count / mesh.size)
+    at_once = None if jax.default_backend() == "cpu" else min(AT_ONCE, each)
+
+    def local(pairs: Any, *arguments: Any) -> Any:
+        return jax.lax.map(lambda pair: function(pair, *arguments), pairs, batch_size=at_once)
+
+    spread, everywhere = PartitionSpec(AXIS), PartitionSpec()
+    shared = jax.shard_map(
+        local,
+        mesh=mesh,
+        in_specs=(spread, *[everywhere] * len(arguments)),
+        out_specs=spread,
+        check_vma=False,
+    )
+    # The last pair fills up what a device lacks; what comes of that is cut off.
+    rows = np.minimum(np.arange(each * mesh.size), count - 1)
+    pairs = jax.tree.map(lambda leaf: np.asarray(leaf)[rows], pairs)
+    found = jax.device_get(jax.jit(shared)(pairs, *on_all_devices(mesh, arguments)))
+    return jax.tree.map(lambda leaf: leaf[:count], found)
+
+
+def rows_of_process(count: int) -> np.ndarray:
+    """Which of ``count`` rows are this process's: as many as any other's.
+
+    The last row fills up what a process lacks; `from_all_processes` cuts that off.
+    """
+    processes = jax.process_count()
+    own = np.arange(math.ceil(count / processes)) * processes + jax.process_index()
+    return np.minimum(own, count - 1)
+
+
+def from_all_processes(found: Any, count: int) -> Any:
+    """What each process found of its `rows_of_process`, of all ``count`` rows in their order."""
+    if jax.process_count() == 1:
+        return found
+    gathered = multihost_utils.process_allgather(found)  # processes first
+
+    def in_order(leaf: np.ndarray) -> np.ndarray:
+        return np.swapaxes(leaf, 0, 1).reshape(-1, *leaf.shape[2:])[:count]
+
+    return jax.tree.map(in_order, gathered)
