@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Int
 
 AXIS = "pairs"
 AT_ONCE = 16  # answers of a GPU or TPU; the memory of a larger number may be lacking
@@ -99,37 +98,51 @@ def on_all_devices(mesh: Mesh, tree: Any) -> Any:
     return jax.tree.map(put, tree)
 
 
+def spread_rows(mesh: Mesh, rows: Any) -> Any:
+    """A batch over the devices of the mesh, of which each process has the rows of its own."""
+    spread = NamedSharding(mesh, PartitionSpec(AXIS))
+    return jax.tree.map(lambda leaf: jax.make_array_from_process_local_data(spread, leaf), rows)
+
+
 def mean_over_pairs(
-    mesh: Mesh, function: Callable[..., Any], count: int, *arguments: Any, rounds: int = 1
+    mesh: Mesh,
+    function: Callable[..., Any],
+    count: int,
+    *arguments: Any,
+    rounds: int = 1,
+    split: bool = False,
 ) -> Any:
     """The mean of ``function(i, *arguments)`` over i in 0..count-1; the one place with a batch.
 
-    The devices share the numbers. On a GPU or TPU each takes its part in ``rounds``, all pairs of a
-    round at once; on a CPU pair by pair: XLA's own threads give almost nothing at these sizes, a
-    device for each core does. Bit for bit the same for the same devices and rounds only, as the
-    order of the sum depends on them.
+    The devices share the numbers; with ``split`` also the first argument, which has a row for each
+    number: ``function`` is given that row. On a GPU or TPU each device takes its part in
+    ``rounds``, all pairs of a round at once; on a CPU pair by pair: XLA's own threads give almost
+    nothing at these sizes, a device for each core does. Bit for bit the same for the same devices
+    and rounds only, as the order of the sum depends on them.
     """
     function = jax.jit(function)  # traced once, for its shapes and for the sum
     by_pair = jax.default_backend() == "cpu"
     rounds = 1 if by_pair else rounds
     each = rounds * math.ceil(count / (mesh.size * rounds))  # numbers of a device
+    rows, arguments = arguments[:split], arguments[split:]
 
-    def local(numbers: Int[Array, " each"], *arguments: Any) -> Any:
-        def value(i: Int[Array, ""]) -> Any:
+    def local(own: tuple[Any, ...], *arguments: Any) -> Any:
+        def value(one: tuple[Any, ...]) -> Any:
             # Numbers from count on only fill the last round.
-            found = function(i, *arguments)
-            return jax.tree.map(lambda leaf: jnp.where(i < count, leaf, 0), found)
+            found = function(*one, *arguments)
+            return jax.tree.map(lambda leaf: jnp.where(one[0] < count, leaf, 0), found)
 
-        def add(total: Any, some: Int[Array, ...]) -> tuple[Any, None]:
+        def add(total: Any, some: tuple[Any, ...]) -> tuple[Any, None]:
             if by_pair:
                 return jax.tree.map(jnp.add, total, value(some)), None
             values = jax.vmap(value)(some)
             return jax.tree.map(lambda t, v: t + jnp.sum(v, axis=0), total, values), None
 
-        shapes = jax.eval_shape(function, numbers[0], *arguments)
+        shapes = jax.eval_shape(function, *jax.tree.map(lambda leaf: leaf[0], own), *arguments)
         zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-        parts = numbers if by_pair else numbers.reshape(rounds, -1)
-        return jax.lax.psum(jax.lax.scan(add, zero, parts)[0], AXIS)
+        if not by_pair:
+            own = jax.tree.map(lambda leaf: leaf.reshape(rounds, -1, *leaf.shape[1:]), own)
+        return jax.lax.psum(jax.lax.scan(add, zero, own)[0], AXIS)
 
     total = jax.shard_map(
         local,
@@ -138,7 +151,7 @@ def mean_over_pairs(
         out_specs=PartitionSpec(),
         # Checked, jax.grad inside would sum over the devices by itself, pair by pair.
         check_vma=False,
-    )(jnp.arange(each * mesh.size, dtype=jnp.int32), *arguments)
+    )((jnp.arange(each * mesh.size, dtype=jnp.int32), *rows), *arguments)
     return jax.tree.map(lambda value: value / count, total)
 
 
