@@ -132,7 +132,7 @@ def by_devices(count: int, numbers: list[int]) -> dict[str, Any]:
             found[number] = executor.submit(train_on, number, count).result()
     first = found[numbers[0]]["pairs_per_s"] / numbers[0]
     efficiency = {str(x): round(y["pairs_per_s"] / x / first, 2) for x, y in found.items()}
-    return {"devices": {str(x): y for x, y in found.items()}, "efficiency": efficiency}
+    return {"training": {str(x): y for x, y in found.items()}, "efficiency": efficiency}
 
 
 def train_on(devices: int, count: int) -> dict[str, float]:
