@@ -7,14 +7,18 @@
 
 The configuration's data set and protocol decide the pairs: --config.protocol.noise_sigma=0.0
 scores without noise, --config.protocol.disjoint=True without common points. Scans, of which
---benchmark=3DLoMatch takes those of little overlap, have a table of registration recall too. All is
+--benchmark=3DLoMatch takes those of little overlap, have a table of registration recall too. The
+networks' pairs are shared by all devices, or by --config.train.devices of them, and all pairs by
+processes as in training; --config.train.precision=bfloat16 is for the networks' products. All is
 also written to RUN_DIR/evaluation_SET.csv and .json, and with --report drawn on a page beside them.
 """
 
+import dataclasses
 import shlex
 import sys
 from pathlib import Path
 
+import jax
 from absl import app, flags, logging
 from ml_collections import config_flags
 
@@ -26,8 +30,10 @@ from dbdnet_jax.evaluation.run import evaluate
 from dbdnet_jax.evaluation.sweep import SWEEP_PAIRS, SWEEPS, render_sweep, save_sweep, sweep
 from dbdnet_jax.evaluation.tables import render, save
 from dbdnet_jax.io.files import require_writable, write_atomic
-from dbdnet_jax.io.programs import keep_compiled_programs, require_device
+from dbdnet_jax.networks.params import Params, bfloat16_kernels
+from dbdnet_jax.networks.table import DEFAULT_METHOD, method_of
 from dbdnet_jax.networks.weights import PRETRAINED, load_named
+from dbdnet_jax.training import launch
 from dbdnet_jax.training.config import parse_flags, read_config
 from dbdnet_jax.training.run_folder import load_best, was_trained
 from dbdnet_jax.training.task import RunConfig
@@ -42,6 +48,7 @@ COUNT = flags.DEFINE_integer("count", None, "Only the first pairs.", lower_bound
 SWEEP = flags.DEFINE_multi_enum(
     "sweep", None, list(SWEEPS), "Vary this part of the protocol instead; may be given repeatedly."
 )
+MANY = 1 << 16  # pairs: more than a CPU's cores
 REPORT = flags.DEFINE_bool("report", False, "Draw a page too, with the sweeps saved in RUN_DIR.")
 
 
@@ -63,6 +70,17 @@ def choose_weights(
     return [Weights(config_name, load_named(config_name))]
 
 
+def _rounded(label: str, params: Params) -> Weights:
+    """Weights whose products are in bfloat16."""
+    method = method_of(params.config)
+    if method != DEFAULT_METHOD:
+        raise ValueError(
+            f"config.train.precision must be 'float32' for weights of another method than "
+            f"{DEFAULT_METHOD}; got 'bfloat16' for {label} of {method}. Score them apart."
+        )
+    return Weights(label, dataclasses.replace(params, networks=bfloat16_kernels(params.networks)))
+
+
 def run_sweeps(config: RunConfig, weights: list[Weights], run_dir: Path) -> None:
     """Print and write one table for each sweep asked for."""
     for name in SWEEP.value or ():
@@ -75,8 +93,11 @@ def run_sweeps(config: RunConfig, weights: list[Weights], run_dir: Path) -> None
                 run_dir,
                 seed=config.train.seed,
                 count=COUNT.value or SWEEP_PAIRS,
+                devices=config.train.devices,
             )
         )
+        if jax.process_index():
+            continue  # the first process prints and writes
         command = shlex.join(["python", *sys.argv])
         print(render_sweep(name, points, command), end="\n\n")
         save_sweep(name, points, run_dir, command)
@@ -92,16 +113,17 @@ def main(argv: list[str]) -> None:
             "the sweeps that were saved."
         )
     logging.set_verbosity(logging.WARNING)
-    keep_compiled_programs()
     config_name = Path(config_flags.get_config_filename(flags.FLAGS["config"])).stem
     run_dir = Path(RUN_DIR.value or Path("runs") / config_name)
     try:
         require_writable(run_dir)
-        require_device()
         if REPORT.value:
             require_drawing()
         config = read_config(CONFIG.value)
+        launch.start(config.train.devices, COUNT.value or MANY)
         weights = choose_weights(PARAMS.value, RUN_DIR.value, config_name)
+        if config.train.precision == "bfloat16":
+            weights = [_rounded(*entry) for entry in weights]
         if SWEEP.value:
             return run_sweeps(config, weights, run_dir)
         evaluation = evaluate(
@@ -110,7 +132,10 @@ def main(argv: list[str]) -> None:
             seed=config.train.seed,
             command=shlex.join(["python", *sys.argv]),
             count=COUNT.value,
+            devices=config.train.devices,
         )
+        if jax.process_index():
+            return
         print(render(evaluation))
         save(evaluation, run_dir)
         if REPORT.value:

@@ -9,7 +9,6 @@ its state first and end it with status 0. The best weights end up in
 RUN_DIR/params.npz, the curves in RUN_DIR/STAGE/*.csv and, for TensorBoard, beside them.
 """
 
-import os
 import shlex
 import sys
 from pathlib import Path
@@ -23,12 +22,11 @@ from dbdnet_jax.data.training_pairs import load_training_pairs
 from dbdnet_jax.evaluation.methods import Weights
 from dbdnet_jax.evaluation.run import evaluate
 from dbdnet_jax.evaluation.tables import render, save
-from dbdnet_jax.io.programs import keep_compiled_programs, require_device
 from dbdnet_jax.networks.table import LEARNED
 from dbdnet_jax.networks.weights import save_params
+from dbdnet_jax.training import launch
 from dbdnet_jax.training.config import parse_flags, read_config
 from dbdnet_jax.training.loop import fit
-from dbdnet_jax.training.parallel import join_processes
 from dbdnet_jax.training.preemption import Interrupted, Preempted, interrupt_on_signals
 from dbdnet_jax.training.run_folder import JOINT, load_best
 from dbdnet_jax.training.table import STAGES
@@ -38,12 +36,6 @@ RUN_DIR = flags.DEFINE_string("run_dir", None, "Where results go; runs/NAME if n
 STAGE = flags.DEFINE_string(
     "stage", "all", "What to train: a stage of the method, or all (or both) but joint."
 )
-DISTRIBUTED = flags.DEFINE_bool(
-    "distributed", False, "One of several processes that train together; see docs/scaling.md."
-)
-COORDINATOR = flags.DEFINE_string("coordinator", None, "HOST:PORT of process 0 of several.")
-PROCESSES = flags.DEFINE_integer("processes", None, "How many train together.", lower_bound=1)
-PROCESS_ID = flags.DEFINE_integer("process_id", None, "Which of them this is, from 0.")
 EVALUATE = flags.DEFINE_bool("evaluate", True, "Print the table of results at the end.")
 
 
@@ -82,15 +74,8 @@ def train(run_dir: Path) -> None:
     """`main` between its flags and its errors."""
     config = read_config(CONFIG.value)
     stages = stages_of(config.method, STAGE.value)
-    # Before anything asks JAX for a device: the number is fixed from then on. More devices
-    # than pairs in a step would have nothing to do.
-    pairs = max(stage.batch_size for stage in config.stages.values())
-    devices = config.train.devices // (PROCESSES.value or 1) or min(os.cpu_count() or 1, pairs)
-    jax.config.update("jax_num_cpu_devices", devices)
-    if DISTRIBUTED.value or COORDINATOR.value:
-        join_processes(COORDINATOR.value, PROCESSES.value, PROCESS_ID.value)
-    keep_compiled_programs()
-    require_device()
+    most = max(stage.batch_size for stage in config.stages.values())
+    launch.start(config.train.devices, most)
     for stage in stages:
         stream = load_training_pairs(
             config.data,
@@ -101,21 +86,21 @@ def train(run_dir: Path) -> None:
         )
         fit(config, stage, run_dir, stream)
     params = load_best(run_dir)
-    if jax.process_index():
-        return  # the first process does the rest
-    save_params(run_dir / "params.npz", params)
-    print(f"The best weights are in {run_dir / 'params.npz'}.")
-    if jax.process_count() > 1:
-        print("Several processes make no table of results; evaluate.py does.")
-    elif EVALUATE.value and set(LEARNED[config.method].parts) <= params.networks.keys():
+    first = jax.process_index() == 0
+    if first:
+        save_params(run_dir / "params.npz", params)
+        print(f"The best weights are in {run_dir / 'params.npz'}.")
+    if EVALUATE.value and set(LEARNED[config.method].parts) <= params.networks.keys():
         evaluation = evaluate(
             [Weights("params", params)],
             load_test_pairs(config.data, config.protocol, run_dir),
             seed=config.train.seed,
             command=shlex.join(["python", *sys.argv]),
+            devices=config.train.devices,
         )
-        print(render(evaluation))
-        save(evaluation, run_dir)
+        if first:
+            print(render(evaluation))
+            save(evaluation, run_dir)
 
 
 if __name__ == "__main__":

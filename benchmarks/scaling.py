@@ -1,21 +1,26 @@
-"""Thousands of pairs: how processes share them, what memory they hold, and what a kill costs.
+"""How processes share thousands of pairs and devices a training, and what a kill costs.
 
     python -m benchmarks.scaling --part=pairs --count=300 --jobs=1,2
     python -m benchmarks.scaling --part=memory --count=2000
     python -m benchmarks.scaling --part=dask --count=1000
+    python -m benchmarks.scaling --part=training --count=200 --jobs=1,2
 
 ``pairs`` aligns noisy test pairs of CAD shapes with `align_pairs`, every tenth damaged, on one
 process and on more: seconds with the start, and from the first answer to the last, so that starting
 counts for none. ``memory`` aligns in this process and gives its resident memory at 100 alignments
 and at the end. ``dask`` aligns on two workers of Dask, of which one is killed half-way. Each fails
-if a pair has no answer, or two, or if one that is not damaged fails.
+if a pair has no answer, or two, or if one that is not damaged fails. ``training`` takes steps of
+the CAD configuration's overlap stage, of batches of four pairs: on one XLA device that has one
+core, and on more with a core each; its efficiency is the speed against that many times the first.
 """
 
 import argparse
+import multiprocessing
 import os
 import signal
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -27,6 +32,7 @@ from dbdnet_jax.alignment.align_pairs import align_pairs
 from dbdnet_jax.data.frozen import cad_test_pairs
 from dbdnet_jax.io.programs import keep_compiled_programs
 
+BATCH = 4  # pairs of a training step
 EVERY = 10  # of so many pairs one is damaged
 WARM = 100  # alignments after which memory is held against that of all
 
@@ -111,18 +117,61 @@ def by_dask(count: int) -> dict[str, Any]:
         return answer(results, count, True, lambda: os.kill(processes[0], signal.SIGKILL))
 
 
+def by_devices(count: int, numbers: list[int]) -> dict[str, Any]:
+    """Median pairs a second of training steps on each number of devices, in processes of their own.
+
+    Raises:
+      SystemExit: there are not so many cores.
+    """
+    there = len(os.sched_getaffinity(0))
+    if max(numbers) > there:
+        raise SystemExit(f"--jobs must be at most the {there} cores there are; got {numbers}.")
+    found = {}
+    for number in numbers:
+        with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as executor:
+            found[number] = executor.submit(train_on, number, count).result()
+    first = found[numbers[0]]["pairs_per_s"] / numbers[0]
+    efficiency = {str(x): round(y["pairs_per_s"] / x / first, 2) for x, y in found.items()}
+    return {"training": {str(x): y for x, y in found.items()}, "efficiency": efficiency}
+
+
+def train_on(devices: int, count: int) -> dict[str, float]:
+    """Steps on so many devices and cores, in a process that has used none yet."""
+    # Here, for the other parts' processes import this file and need none of it.
+    import jax
+
+    from benchmarks.machine import matrix_rate
+    from benchmarks.step import training_step
+    from configs import cad
+    from dbdnet_jax.data.cad import cad_split
+    from dbdnet_jax.data.training_pairs import pairs_of_shapes
+    from dbdnet_jax.training.config import read_config
+
+    cores = sorted(os.sched_getaffinity(0))[:devices]
+    os.sched_setaffinity(0, cores)
+    jax.config.update("jax_num_cpu_devices", devices)
+    config = cad.get_config()
+    config.train.batch_size, config.train.devices = BATCH, devices
+    read, shapes = read_config(config), cad_split("val")
+    stream = pairs_of_shapes(shapes, shapes, read.protocol, seed=0, validation_pairs=1)
+    steps = max(1, count // BATCH)
+    return training_step(read, stream, "overlap", matrix_rate(), steps)
+
+
 def main() -> None:
     """Print one JSON object."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--part", choices=("pairs", "memory", "dask"), required=True)
+    parser.add_argument("--part", choices=("pairs", "memory", "dask", "training"), required=True)
     parser.add_argument("--count", type=int, default=300, help="pairs, or alignments")
-    parser.add_argument("--jobs", default="1,2", help="numbers of processes")
+    parser.add_argument("--jobs", default="1,2", help="numbers of processes, or devices")
     parser.add_argument("--out", help="file for the record, beside printing it")
     options = parser.parse_args()
+    jobs = [int(x) for x in options.jobs.split(",")]
     parts = {
-        "pairs": lambda: by_processes(options.count, [int(x) for x in options.jobs.split(",")]),
+        "pairs": lambda: by_processes(options.count, jobs),
         "memory": lambda: memory(options.count),
         "dask": lambda: by_dask(options.count),
+        "training": lambda: by_devices(options.count, jobs),
     }
     publish(record("benchmarks.scaling", parts[options.part]()), options.out)
 

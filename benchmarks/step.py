@@ -61,7 +61,7 @@ def answer(config: RunConfig, params: Params, pair: Pair, rate: float) -> dict[s
 
 
 def training_step(
-    config: RunConfig, stream: PairStream, stage: str, rate: float
+    config: RunConfig, stream: PairStream, stage: str, rate: float, steps: int
 ) -> dict[str, float]:
     """One stage's step on fresh parameters; registration learns from the true overlap."""
     task = STAGES[config.method][stage].make_task(config, "")
@@ -80,12 +80,13 @@ def training_step(
         ema_decay=train.ema_decay,
         accumulate=train.accumulate,
         remat=train.remat,
+        precision=train.precision,
     )
     state = on_all_devices(mesh, init_state(task.trainable, optimizer, ema_decay=train.ema_decay))
     # All four, so that the program may be called with what it was compiled for.
     rest = on_all_devices(mesh, (task.frozen, jax.random.key(0), next(stream.arrays(0))))
     program, figures = compile_timed(step, state, *rest)
-    figures |= measure(lambda: program(state, *rest)[1].loss, STEPS.value)
+    figures |= measure(lambda: program(state, *rest)[1].loss, steps)
     seconds = figures["median_s"]
     # Each pass and each iteration is trained for itself.
     forward = sum(getattr(arithmetic, stage)(config.model, config.protocol.size).values())
@@ -120,7 +121,7 @@ def main(argv: list[str]) -> None:
         "register_one_pair": answer(config, params, pair, rate),
     }
     for stage in () if RELEASED.value else ("overlap", "registration"):
-        figures[f"{stage}_step"] = training_step(config, stream, stage, rate)
+        figures[f"{stage}_step"] = training_step(config, stream, stage, rate, STEPS.value)
     publish(record("benchmarks.step", figures), OUT.value)
 
 

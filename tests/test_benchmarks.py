@@ -11,6 +11,7 @@ import pytest
 from jax.extend.core import jaxprs_in_params
 
 from benchmarks import arithmetic, machine
+from benchmarks.scaling import by_devices
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.dbdnet.register import register
 from dbdnet_jax.networks.initial import init_params
@@ -84,3 +85,8 @@ def test_a_record_says_what_it_was_measured_on_and_goes_to_a_file(tmp_path, caps
     assert json.loads((tmp_path / "record.json").read_text()) == found
     assert json.loads(capsys.readouterr().out) == found
     assert np.isfinite(machine.peak_gib())
+
+
+def test_a_training_on_more_devices_than_cores_is_not_measured():
+    with pytest.raises(SystemExit, match=r"at most the \d+ cores there are; got \[1, 100000\]"):
+        by_devices(4, [1, 100_000])

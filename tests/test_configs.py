@@ -187,6 +187,7 @@ def test_a_stage_may_resume_only_with_what_decides_its_outcome():
         ({"overlap__epochs": 0.0}, r"config\.overlap\.epochs must be positive; got 0"),
         ({"method": "icp"}, r"config\.method must be one of dbdnet, masknet.*; got 'icp'"),
         ({"train__optimizer": "sgd"}, r"optimizer must be one of \('adamw', 'adam'\); got 'sgd'"),
+        ({"train__precision": "half"}, r"one of \('float32', 'bfloat16'\); got 'half'"),
         ({"train__schedule": "steps"}, r"milestones must be given for schedule='steps'"),
         ({"joint__batch_size": 0}, r"config\.joint\.batch_size must be from 1 .*; got 0"),
         (
@@ -200,6 +201,13 @@ def test_a_stage_may_resume_only_with_what_decides_its_outcome():
 def test_a_wrong_configuration_is_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         read_config(with_change(**changes))
+
+
+def test_a_precision_is_for_the_method_that_knows_it():
+    config = masknet_cad.get_config()
+    config.train.precision = "bfloat16"
+    with pytest.raises(ValueError, match="'float32' but for the method dbdnet; got 'bfloat16' for"):
+        read_config(config)
 
 
 def leaves(section: ConfigDict, *path: str) -> list[tuple[str, ...]]:

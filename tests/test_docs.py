@@ -39,6 +39,8 @@ def flags_of(script: Path) -> set[str]:
     names |= set(re.findall(r'add_argument\(\s*"--([\w-]+)"', text))
     for name in re.findall(r"^from benchmarks\.(\w+) import", text, re.MULTILINE):
         names |= flags_of(ROOT / "benchmarks" / f"{name}.py")
+    if "import launch\n" in text:
+        names |= flags_of(ROOT / "dbdnet_jax" / "training" / "launch.py")
     return names
 
 

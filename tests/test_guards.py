@@ -26,7 +26,7 @@ def test_signatures_are_not_checked_for_users():
 
 def test_aligning_needs_no_library_of_training():
     """All that the train extra brings, and the others, are absent; the weights load and serve."""
-    extras = """optax orbax grain h5py ml_collections tensorboardX distributed open3d plotly
+    extras = """optax orbax grain h5py ml_collections tensorboardX distributed pyarrow open3d plotly
     matplotlib jinja2"""
     command = f"""
 import sys

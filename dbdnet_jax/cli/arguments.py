@@ -74,7 +74,7 @@ def make_parser() -> argparse.ArgumentParser:
     add("--batch", type=Path, metavar="PAIRS", help="a list of pairs, or a folder")
     add("--jobs", type=_count, metavar="N", help="batch: processes; default one a core")
     add("--executor", type=_address, metavar="dask://HOST:PORT", help="batch: a Dask scheduler")
-    add("--results", type=Path, metavar="JSONL", help="batch: file of answers to go on from")
+    add("--results", type=Path, metavar="FILE", help="batch: .jsonl or .parquet to go on from")
     add("--json", action="store_true", help="print JSON, a line for each pair, instead of text")
     add("--params", default="cad", metavar="W", help="weights: a .npz file, or a name (cad)")
     add("--search", choices=("auto", "near", "any"), default="auto", help="which rotations")

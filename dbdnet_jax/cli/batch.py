@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from dbdnet_jax.cli.answers import as_record, show, write_files
 from dbdnet_jax.cli.jobs import Job
 from dbdnet_jax.cli.one_pair import Answer, Settings, align_files, prepare
-from dbdnet_jax.cli.results import append, find_done, open_results
+from dbdnet_jax.cli.results import append, find_done, finished, open_results
 from dbdnet_jax.cli.statuses import ALIGNED, UNSURE
 from dbdnet_jax.io.dask_executor import open_dask
 from dbdnet_jax.io.terminal import say
@@ -35,7 +35,11 @@ def run_batch(options: argparse.Namespace, settings: Settings, jobs: Sequence[Jo
     statuses = [ALIGNED if valid else UNSURE for valid in done.values()]
     left = [job for job in jobs if job not in done]
     answers = _answers(options, settings, left) if left else contextlib.nullcontext(())
-    with answers as found, _progress(len(left)) as bar:
+    with (
+        contextlib.nullcontext() if results is None else finished(results),
+        answers as found,
+        _progress(len(left)) as bar,
+    ):
         for number, answer in found:
             answer = write_files(answer)
             if results is not None:

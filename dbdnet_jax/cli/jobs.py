@@ -4,6 +4,7 @@ import argparse
 from pathlib import Path
 from typing import NamedTuple
 
+from dbdnet_jax.cli.parquet import PARQUET, lines_file
 from dbdnet_jax.io.outputs import TRANSFORM_ENDINGS, check_output, require_apart
 from dbdnet_jax.io.pair_lists import FilePair, read_pairs
 
@@ -53,8 +54,8 @@ def read_jobs(options: argparse.Namespace) -> list[Job]:
                 check_output(path, endings)
                 written.append(path)
     if options.results is not None:
-        check_output(options.results, (".jsonl",))
-        written.append(options.results)
+        check_output(options.results, (".jsonl", PARQUET))
+        written += {options.results, lines_file(options.results)}
     read = [path for job in jobs for path in (job.pair.source, job.pair.target)]
     read += filter(None, (options.initial, options.batch, Path(options.params)))
     require_apart(read, written)

@@ -1,20 +1,31 @@
-"""A file of results, a line of JSON for each pair, from which a batch goes on."""
+"""A file of results, a line of JSON for each pair or Parquet, from which a batch goes on.
 
+Nothing can be added to a Parquet file, and one that was cut short is lost. So lines are written
+while a batch runs, into a file beside it, and put into the Parquet file when it ends.
+"""
+
+import contextlib
 import json
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from dbdnet_jax.cli.answers import as_line
 from dbdnet_jax.cli.jobs import Job
+from dbdnet_jax.cli.parquet import PARQUET, lines_file, load_pyarrow, read_lines, write_lines
 
 
 class Results(NamedTuple):
-    """A file to append to, the options that its answers have, and which pairs have one."""
+    """A file to append to, the options that its answers have, and which pairs have one.
+
+    ``table`` is the Parquet file that they go to in the end, if there is to be one.
+    """
 
     path: Path
     options: dict[str, Any]
     valid: dict[tuple[str, str, str], bool]
+    table: Path | None
 
 
 def open_results(path: Path, options: dict[str, Any]) -> Results:
@@ -25,7 +36,14 @@ def open_results(path: Path, options: dict[str, Any]) -> Results:
     Raises:
       ValueError: it is no file of results, or one of other options.
       OSError: it cannot be read or written.
+      MissingExtraError: a library is missing for Parquet.
     """
+    table, held_lines = None, []
+    if path.suffix.lower() == PARQUET:
+        load_pyarrow()
+        table = path
+        held_lines = read_lines(path) if path.exists() else []
+    path = lines_file(path)
     options = json.loads(json.dumps(options))
     valid = {}
     with path.open("ab+") as file:
@@ -37,7 +55,7 @@ def open_results(path: Path, options: dict[str, Any]) -> Results:
                 file.truncate(sum(map(len, lines)))
             else:
                 lines.append(cut)
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate([*held_lines, *lines], 1 - len(held_lines)):
         try:
             record = json.loads(line)
             held = record["options"]
@@ -55,7 +73,7 @@ def open_results(path: Path, options: dict[str, Any]) -> Results:
             )
         if "failure" not in record:
             valid[key] = record["valid"]
-    return Results(path, options, valid)
+    return Results(path, options, valid, table)
 
 
 def find_done(results: Results, job: Job) -> bool | None:
@@ -70,3 +88,22 @@ def append(results: Results, record: dict[str, Any]) -> None:
         file.write(as_line(record | {"options": results.options}) + "\n")
         file.flush()
         os.fsync(file.fileno())
+
+
+@contextlib.contextmanager
+def finished(results: Results) -> Iterator[None]:
+    """On leaving, Ctrl-C included, the lines go to the Parquet file, if there is to be one."""
+    try:
+        yield
+    finally:
+        if results.table is not None:
+            _finish(results, results.table)
+
+
+def _finish(results: Results, table: Path) -> None:
+    new = results.path.read_bytes().splitlines(keepends=True)
+    if new:
+        before = read_lines(table) if table.exists() else []
+        # The same ones twice, where a kill came before they were gone.
+        write_lines(table, list(dict.fromkeys([*before, *new])))
+    results.path.unlink()

@@ -260,6 +260,7 @@ def batches(
     batch_size: int,
     seed: int,
     start_step: int = 0,
+    share: tuple[int, int] = (0, 1),
     points: int = POINTS,
     radius_m: float = OVERLAP_RADIUS_M,
     cache: str | Path | None = None,
@@ -268,8 +269,9 @@ def batches(
 
     Batch ``step`` depends on (seed, step) only, so a run resumed with ``start_step`` sees what the
     unbroken run would have seen. Every epoch is a new order and a new draw of points; a batch may
-    span two epochs. Two threads load up to `READ_AHEAD` batches ahead of the caller; an error in
-    one of them is raised by ``next``.
+    span two epochs. A ``share`` of (i, n) reads and yields the i-th of n equal parts of each batch,
+    which n must divide: what one of n processes needs. Two threads load up to `READ_AHEAD` batches
+    ahead of the caller; an error in one of them is raised by ``next``.
     """
     import grain
 
@@ -286,8 +288,10 @@ def batches(
         )
 
     order = grain.MapDataset.range(len(info)).shuffle(seed=seed).repeat()
+    part, parts = share
     # The remainder is that of the endless order; kept, batches of 1 overflow Grain's length.
-    steps = order.map_with_index(load).batch(batch_size, drop_remainder=True)[start_step:]
+    of_steps = order.map_with_index(load).batch(batch_size // parts, drop_remainder=True)
+    steps = of_steps[start_step * parts + part :: parts]
     return iter(
         steps.to_iter_dataset(grain.ReadOptions(num_threads=2, prefetch_buffer_size=READ_AHEAD))
     )

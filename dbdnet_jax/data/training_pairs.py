@@ -34,13 +34,16 @@ class PairStream(NamedTuple):
     """Pairs without end for training, and a fixed set for validation.
 
     ``arrays(start)`` yields what step ``start`` and those after it draw from;
-    ``draw(key, number, arrays)`` makes pair ``number`` of the run from it, under jit.
+    ``draw(key, number, arrays)`` makes pair ``number`` of the run from it, under jit. Where they
+    are ``batched``, that is an array with a row for each pair of the step, of which a process
+    yields its own; ``draw`` is given the pair's row.
     """
 
     epoch_pairs: int
     arrays: Callable[[int], Iterator[Any]]
     draw: Callable[[PRNGKeyArray, Int[Array, ""], Any], Pair]
     validation: Pair  # stacked: every field with a leading axis
+    batched: bool = False
 
 
 def load_training_pairs(
@@ -168,7 +171,7 @@ def _fixed_pairs(shapes: Shapes, protocol: Protocol, count: int) -> Pair:
 def _scans(
     folder: str, protocol: Protocol, seed: int, validation_pairs: int, batch_size: int
 ) -> PairStream:
-    """3DMatch's pairs, read ahead of the step that needs them."""
+    """3DMatch's pairs, read ahead of the step that needs them; a process reads its own."""
     from dbdnet_jax.data.threedmatch import batches, load_info, load_pair
 
     train, validation = load_info(folder, "train"), load_info(folder, "valid")
@@ -188,8 +191,10 @@ def _scans(
             batch_size=batch_size,
             seed=seed,
             start_step=start,
+            share=(jax.process_index(), jax.process_count()),
             **options,
         ),
-        draw=lambda key, number, batch: jax.tree.map(lambda x: x[number % batch_size], batch),
+        draw=lambda key, number, pair: pair,
         validation=jax.tree.map(lambda *leaves: np.stack(leaves), *fixed),
+        batched=True,
     )

@@ -1,5 +1,6 @@
 """The rows of a table: every method as a function on pairs, and what is to be known of it."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -30,6 +31,18 @@ class Traits(NamedTuple):
     aligned: bool = False  # by `align`, as a user calls it
     needs_normals: bool = False
     moves: bool = True  # tries to register at all
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Network:
+    """An answer that devices can share: pure, with its parameters apart."""
+
+    predict: Callable[[Pair, Params], Answer]  # compiled once per shape and model configuration
+    params: Params
+
+    def __call__(self, pair: Pair) -> Answer:
+        """Answer one pair."""
+        return self.predict(pair, self.params)
 
 
 class Method(NamedTuple):
@@ -133,23 +146,27 @@ def from_normals(baseline: Callable[..., Rigid]) -> Answering:
     return method
 
 
-def from_network(params: Params) -> Answering:
-    """The network as a method on pairs; compiled once per shape and model configuration."""
-    predict = jax.jit(learned(params.config).predict)
-    params = fold_params(params)  # once: no part of an answer
-    return lambda pair: predict(params, pair.source, pair.target)
+def from_network(params: Params) -> Network:
+    """The network as a method on pairs."""
+    predict = learned(params.config).predict
+
+    @jax.jit
+    def answer(pair: Pair, params: Params) -> Answer:
+        return predict(params, pair.source, pair.target)
+
+    return Network(answer, fold_params(params))  # once: no part of an answer
 
 
-def from_refined_network(params: Params) -> Answering:
+def from_refined_network(params: Params) -> Network:
     """The network's pose after `refine_multistart`: no ground truth, no normals given."""
     predict = learned(params.config).predict
 
     @jax.jit
-    def refined(params: Params, source: Cloud, target: Cloud) -> Answer:
-        motion = predict(params, source, target).motion
-        return Answer(refine_multistart(source, target, motion).target_from_source)
+    def refined(pair: Pair, params: Params) -> Answer:
+        motion = predict(params, pair.source, pair.target).motion
+        return Answer(refine_multistart(pair.source, pair.target, motion).target_from_source)
 
-    return lambda pair: refined(params, pair.source, pair.target)
+    return Network(refined, params)
 
 
 def from_align(params: Params) -> Answering:
@@ -170,17 +187,20 @@ def from_align(params: Params) -> Answering:
     return method
 
 
-def from_true_overlap(params: Params) -> Answering:
+def from_true_overlap(params: Params) -> Network:
     """The registration network behind the true overlap labels: a bound, since it is told them.
 
     Its row has no overlap figures.
     """
     method = learned(params.config).predict_given_overlap
     assert method is not None  # only methods that have it get here
-    predict = jax.jit(method)
-    return lambda pair: predict(
-        params, pair.source, pair.target, pair.source_overlap, pair.target_overlap
-    )
+
+    @jax.jit
+    def answer(pair: Pair, params: Params) -> Answer:
+        labels = pair.source_overlap, pair.target_overlap
+        return method(params, pair.source, pair.target, *labels)
+
+    return Network(answer, params)
 
 
 def _points(cloud: Cloud) -> np.ndarray:

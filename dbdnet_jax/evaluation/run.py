@@ -1,19 +1,27 @@
-"""Every method on the same test pairs, one pair at a time: errors and wall time."""
+"""Every method on the same test pairs, shared among devices and processes: errors and time."""
 
 import os
 import time
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float
 from tqdm import tqdm
 
 from dbdnet_jax.data.test_pairs import PairSet
 from dbdnet_jax.errors import MissingExtraError
-from dbdnet_jax.evaluation.methods import Method, Traits, Weights, make_methods, possible
+from dbdnet_jax.evaluation.methods import (
+    Method,
+    Network,
+    Traits,
+    Weights,
+    make_methods,
+    possible,
+)
 from dbdnet_jax.metrics.pose import (
     Confusion,
     OverlapSummary,
@@ -26,7 +34,16 @@ from dbdnet_jax.metrics.pose import (
     summarise_overlap,
 )
 from dbdnet_jax.metrics.recall import ScanRecall, Scans, correspondence_rmse_m, scan_recall
+from dbdnet_jax.networks.params import Params
+from dbdnet_jax.training.parallel import (
+    from_all_processes,
+    local_mesh,
+    map_over_pairs,
+    rows_of_process,
+)
 from dbdnet_jax.types import Answer, Pair, Rigid
+
+TIMED = 20  # pairs of a method that devices share; those after them are not answered one by one
 
 
 class Row(NamedTuple):
@@ -65,16 +82,24 @@ class Evaluation(NamedTuple):
 
 
 def evaluate(
-    weights: Sequence[Weights], test: PairSet, *, seed: int, command: str, count: int | None = None
+    weights: Sequence[Weights],
+    test: PairSet,
+    *,
+    seed: int,
+    command: str,
+    count: int | None = None,
+    devices: int = 1,
 ) -> Evaluation:
     """Score networks, the same untrained (from ``seed``), and the baselines on test pairs.
 
     ``count`` keeps the first pairs only, which the name then says (the hash stays that of the
-    whole set); ``command`` is what to show as the way to get here.
+    whole set); ``command`` is what to show as the way to get here. ``devices`` share the pairs of
+    the networks (0: all there are), processes those of every method; each returns the whole.
 
     Raises:
-        ValueError: params without the networks that their method needs.
+        ValueError: params without the networks that their method needs, or too few devices.
     """
+    mesh = local_mesh(devices)
     name, pairs, digest, scans, symmetric = test
     if count is not None and count < len(pairs.source.count):
         name = f"{name}_first_{count}"
@@ -87,17 +112,23 @@ def evaluate(
         unit_sphere=scans is None,
     )
     return Evaluation(
-        rows=evaluate_methods(methods, pairs, scans),
+        rows=evaluate_methods(methods, pairs, scans, mesh),
         constant_overlap=constant_overlap(pairs),
         pair_set=name,
         pairs=len(pairs.source.count),
         pairs_hash=digest,
         seed=seed,
         command=command,
-        device=f"{jax.devices()[0].device_kind}, {os.cpu_count()} cores",
+        device=_describe(mesh),
         test_pairs=pairs,
         symmetric=symmetric,
     )
+
+
+def _describe(mesh: Mesh) -> str:
+    """The hardware; where several devices shared the pairs, how many."""
+    kind, sharing = mesh.devices.flat[0].device_kind, jax.process_count() * mesh.size
+    return f"{kind}, {os.cpu_count()} cores" + (f", {sharing} devices" if sharing > 1 else "")
 
 
 class _Scored(NamedTuple):
@@ -108,33 +139,32 @@ class _Scored(NamedTuple):
     overlap: Confusion | None
 
 
-def evaluate_method(method: Method, pairs: Pair, scans: Scans | None = None) -> Row:
+def evaluate_method(
+    method: Method, pairs: Pair, scans: Scans | None = None, mesh: Mesh | None = None
+) -> Row:
     """One method over stacked NumPy pairs (leading axis on every field).
 
-    With ``scans``, those of the same pairs, the row has their registration recall too.
+    With ``scans``, those of the same pairs, the row has their registration recall too. The devices
+    of a `local_mesh` share the pairs of a network, and processes those of any method; either way
+    each pair is answered once, and every process has the whole row.
 
-    The time is the median over the pairs of the wall seconds until the answer is there. The
-    method is called once on the first pair beforehand, so that no compilation is in it. A method
-    whose library is missing gives a row with a note instead of figures.
+    The time is the median over the pairs of the wall seconds until the answer is there, one pair
+    after another on one device; where several share them, over the first `TIMED` of each process.
+    The method is called once on the first pair beforehand, so that no compilation is in it. A
+    method whose library is missing gives a row with a note instead of figures.
     """
-    score = jax.jit(_score)
-    scores: list[_Scored] = []
-    seconds: list[float] = []
-    rmse_m: list[float] = []
-    row = Row(method.name, traits=method.traits)
+    row, note, found = Row(method.name, traits=method.traits), "", None
+    count = len(pairs.source.count)
+    own = rows_of_process(count)
     try:
-        jax.block_until_ready(method.answer(_pair(pairs, 0)))
-        for i in range(len(pairs.source.count)):
-            pair = _pair(pairs, i)
-            start = time.perf_counter()
-            answer = jax.block_until_ready(method.answer(pair))
-            seconds.append(time.perf_counter() - start)
-            scores.append(jax.device_get(score(answer, pair)))
-            if scans is not None and answer.motion is not None:
-                rmse_m.append(correspondence_rmse_m(answer.motion, *scans.correspondences[i]))
+        found = _score_all(method, jax.tree.map(lambda leaf: leaf[own], pairs), mesh)
     except MissingExtraError as error:
-        return row._replace(note=str(error))
-    errors, motions, overlap = jax.tree.map(lambda *leaves: np.stack(leaves), *scores)
+        note = str(error)
+    lacking = from_all_processes(np.array([not found]), jax.process_count())
+    if found is None or lacking.any():
+        return row._replace(note=note or f"process {lacking.argmax()} lacks what it needs.")
+    errors, motions, overlap = from_all_processes(found[0], count)
+    seconds = from_all_processes(found[1], len(found[1]) * jax.process_count())
     row = row._replace(
         seconds_per_pair=float(np.median(seconds)),
         overlap=None if overlap is None else summarise_overlap(overlap),
@@ -144,8 +174,40 @@ def evaluate_method(method: Method, pairs: Pair, scans: Scans | None = None) -> 
     row = row._replace(summary=summarise(errors), errors=errors, motions=motions)
     if scans is None:
         return row._replace(point_distance=np.asarray(_point_distances(motions, pairs)))
+    rmse_m = [
+        correspondence_rmse_m(_row(motions, i), *points)
+        for i, points in enumerate(scans.correspondences)
+    ]
     recall = scan_recall(errors.rotation_deg, errors.translation, np.array(rmse_m), scans)
     return row._replace(recall=recall)
+
+
+def _score_all(
+    method: Method, pairs: Pair, mesh: Mesh | None
+) -> tuple[_Scored, Float[np.ndarray, " timed"]]:
+    """Stacked scores of all pairs, and the wall seconds of those that were answered one by one."""
+    answer, score = method.answer, jax.jit(_score)
+    count = len(pairs.source.count)
+    shared = mesh is not None and mesh.size > 1 and isinstance(answer, Network)
+    scores: list[_Scored] = []
+    seconds: list[float] = []
+    jax.block_until_ready(answer(_row(pairs, 0)))
+    for i in range(min(count, TIMED) if shared else count):
+        pair = _row(pairs, i)
+        start = time.perf_counter()
+        found = jax.block_until_ready(answer(pair))
+        seconds.append(time.perf_counter() - start)
+        scores.append(jax.device_get(score(found, pair)))
+    parts = [jax.tree.map(lambda *leaves: np.stack(leaves), *scores)]
+    if len(scores) < count:
+        assert isinstance(answer, Network) and mesh is not None
+        predict, rest = answer.predict, jax.tree.map(lambda leaf: leaf[len(scores) :], pairs)
+
+        def scored(pair: Pair, params: Params) -> _Scored:
+            return _score(predict(pair, params), pair)
+
+        parts.append(map_over_pairs(mesh, scored, rest, answer.params))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts), np.array(seconds)
 
 
 @jax.jit
@@ -154,11 +216,15 @@ def _point_distances(motions: Rigid, pairs: Pair) -> Float[Array, " pairs"]:
 
 
 def evaluate_methods(
-    methods: Sequence[Method], pairs: Pair, scans: Scans | None = None
+    methods: Sequence[Method],
+    pairs: Pair,
+    scans: Scans | None = None,
+    mesh: Mesh | None = None,
 ) -> list[Row]:
     """One row per method, in the given order, all on the same pairs; shows its progress."""
-    bar = tqdm(methods, desc="evaluating", unit="method", leave=False, disable=None)
-    return [evaluate_method(method, pairs, scans) for method in bar]
+    quiet = True if jax.process_index() else None
+    bar = tqdm(methods, desc="evaluating", unit="method", leave=False, disable=quiet)
+    return [evaluate_method(method, pairs, scans, mesh) for method in bar]
 
 
 def constant_overlap(pairs: Pair) -> OverlapSummary:
@@ -169,8 +235,8 @@ def constant_overlap(pairs: Pair) -> OverlapSummary:
     return summary
 
 
-def _pair(pairs: Pair, i: int) -> Pair:
-    return jax.tree.map(lambda leaf: leaf[i], pairs)
+def _row(stacked: Any, i: int) -> Any:
+    return jax.tree.map(lambda leaf: leaf[i], stacked)
 
 
 def _score(answer: Answer, pair: Pair) -> _Scored:

@@ -15,6 +15,7 @@ from dbdnet_jax.data.test_pairs import load_test_pairs
 from dbdnet_jax.evaluation.methods import Weights, make_methods, possible
 from dbdnet_jax.evaluation.run import Row, evaluate_methods
 from dbdnet_jax.io.files import write_atomic
+from dbdnet_jax.training.parallel import local_mesh
 
 SWEEP_PAIRS = 60  # of each value, unless told otherwise
 NOISE_CLIP = 5.0  # standard deviations, as in the paper's protocol
@@ -75,11 +76,13 @@ def sweep(
     *,
     seed: int,
     count: int,
+    devices: int = 1,
 ) -> Iterator[SweepPoint]:
     """Score the networks and the baselines on ``count`` test pairs for each value of a sweep.
 
     The pairs are those of the data set, drawn anew under each protocol from the same seed, so that
-    a pair keeps its shape from one value to the next; ``seed`` is that of untrained weights.
+    a pair keeps its shape from one value to the next; ``seed`` is that of untrained weights, and
+    ``devices`` are as for `evaluate`.
 
     Raises:
         ValueError: scans, whose overlap and motion are given.
@@ -100,7 +103,7 @@ def sweep(
         pairs = jax.tree.map(lambda leaf: leaf[:count], pairs)
         normals = bool(pairs.source_normals.any())
         able = possible(methods, normals=normals, unit_sphere=True)
-        for row in evaluate_methods(able, pairs):
+        for row in evaluate_methods(able, pairs, mesh=local_mesh(devices)):
             yield SweepPoint(value, row)
 
 

@@ -82,7 +82,7 @@ RMSE, MAE: over all pairs and the three components of the predicted minus the tr
 (xyz, extrinsic, not wrapped) and translation. Error R: angle of R_true^T R (geodesic). Error t:
 norm of the translation of T_true^-1 T. Recall: share of pairs with both errors below. Unit: that of
 the clouds. An answer that is not finite counts as 180 deg and 2 |t_true|. Time: wall clock, one
-pair at a time, compilation excluded."""
+pair at a time on one device, compilation excluded; of 20 pairs where devices share them."""
 RECALL_DEFINITIONS = """\
 Share of pairs with a rotation error < 15 deg and a translation error < 0.3 m, or with an RMSE
 < 0.2 m: that of all true correspondences, the points of the whole source fragment whose nearest

@@ -1,7 +1,8 @@
 """The small layers: affine maps, masked group norm, moves between levels, attention blocks.
 
 Every layer works on one cloud of static size whose valid rows are given by a mask. Parameters are
-cast to the features' type, so a network given float64 computes in float64 throughout. Beside each
+cast to the features' type, so a network given float64 computes in float64 throughout; kernels of
+bfloat16 stay what they are, see `ops.products`. Beside each
 layer stand the shapes of its parameters by name: tracing the full-size network to find them takes
 seconds, loading weights should not. A test holds the lists against the networks.
 """
@@ -17,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from dbdnet_jax.networks.params import Shapes
 from dbdnet_jax.ops.attention import attention
 from dbdnet_jax.ops.grouping import interpolate, max_over_neighbours
+from dbdnet_jax.ops.products import product
 from dbdnet_jax.ops.sampling import divisor
 
 Layers = tuple[tuple[int, int], ...]  # (features, groups of the norm) of each layer
@@ -29,18 +31,21 @@ class Affine(nn.Module):
     """Kernel (in, out) and bias (out,) of an affine map, for layers that apply them in pieces.
 
     Declared as zeros: `initial.init_params` draws the values of the whole network at once.
+    ``of_points``: what it maps are coordinates, which no product rounds.
     """
 
     features: int
+    of_points: bool = False
 
     @nn.compact
     def __call__(
         self, fan_in: int, dtype: jnp.dtype
     ) -> tuple[Float[Array, "in out"], Float[Array, " out"]]:
-        """Declare and return both, cast to ``dtype``."""
+        """Declare and return both, cast to ``dtype``; a kernel of bfloat16 stays one."""
         kernel = self.param("kernel", nn.initializers.zeros, (fan_in, self.features))
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
-        return kernel.astype(dtype), bias.astype(dtype)
+        rounded = kernel.dtype == jnp.bfloat16 and not self.of_points
+        return kernel if rounded else kernel.astype(dtype), bias.astype(dtype)
 
 
 def affine_shapes(name: str, fan_in: int, features: int) -> Shapes:
@@ -51,7 +56,7 @@ def affine_shapes(name: str, fan_in: int, features: int) -> Shapes:
 def dense(affine: Affine, x: Float[Array, "n c"]) -> Float[Array, "n d"]:
     """Apply an affine map to every row: a 1 x 1 convolution."""
     kernel, bias = affine(x.shape[-1], x.dtype)
-    return x @ kernel + bias[None, :]
+    return product(x, kernel) + bias[None, :]
 
 
 class Norm(nn.Module):
@@ -95,11 +100,12 @@ class DenseNorm(nn.Module):
 
     features: int
     groups: int
+    of_points: bool = False
 
     @nn.compact
     def __call__(self, x: Float[Array, "n c"], valid: Bool[Array, " n"]) -> Float[Array, "n d"]:
         """Map, normalise, rectify; rows that are not valid enter no statistic."""
-        x = dense(Affine(self.features, name="conv"), x)
+        x = dense(Affine(self.features, of_points=self.of_points, name="conv"), x)
         weight = valid.astype(x.dtype) / divisor(jnp.sum(valid), x.dtype)
         mean = weight @ x
         centred = jnp.where(valid[:, None], x - mean[None, :], 0.0)
@@ -173,9 +179,10 @@ class MultiHeadAttention(nn.Module):
         packed = Affine(3 * width, name="in_proj")
         kernels, biases = (jnp.split(x, 3, axis=-1) for x in packed(width, query.dtype))
         q, k, v = (
-            x @ kernel + bias[None, :]
+            product(x, kernel) + bias[None, :]
             for x, kernel, bias in zip((query, memory, memory), kernels, biases, strict=True)
         )
+        k, v = (x.astype(kernels[0].dtype) for x in (k, v))
         out = attention(
             q, k, v, memory_valid, self.heads, dropout=self.dropout, dropout_key=dropout_key
         )

@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 from dbdnet_jax.networks.blocks import LEAKY_SLOPE, Affine, Norm, affine_shapes, norm_shapes
 from dbdnet_jax.networks.params import Shapes
 from dbdnet_jax.ops.grouping import max_over_slots
+from dbdnet_jax.ops.products import product
 from dbdnet_jax.ops.sampling import divisor
 
 BLOCK_VALUES = 1 << 17  # of one block's edges, k x rows x channels: 512 KB of float32
@@ -32,20 +33,25 @@ Block = tuple[Array, Array, Array]  # see `_blocks`
 
 
 class EdgeConv(nn.Module):
-    """Two-layer EdgeConv of one level; both layers have ``features`` channels."""
+    """Two-layer EdgeConv of one level; both layers have ``features`` channels.
+
+    ``of_points``: the features that come in are coordinates.
+    """
 
     features: int
     groups: int
+    of_points: bool = False
 
     @nn.compact
     def __call__(
         self, x: Float[Array, "n c"], index: Int[Array, "n k"], valid: Bool[Array, " n"]
     ) -> Float[Array, "n d"]:
         """The new feature of every point; rows that are not valid enter no statistic."""
-        kernel, bias = Affine(self.features, name="conv_0")(2 * x.shape[-1], x.dtype)
+        first = Affine(self.features, of_points=self.of_points, name="conv_0")
+        kernel, bias = first(2 * x.shape[-1], x.dtype)
         difference, own_kernel = jnp.split(kernel, 2, axis=0)
-        near = x @ difference
-        own = x @ (own_kernel - difference) + bias[None, :]
+        near = product(x, difference)
+        own = product(x, own_kernel - difference) + bias[None, :]
         norm = Norm(self.features, self.groups, name="norm_0")
         slope, offset = norm(*edge_moments(near, own, index, valid))
         # The first normalisation, folded into its two inputs.
@@ -108,7 +114,7 @@ def edge_extremes(
     sign = jnp.where(rising, 1.0, -1.0).astype(near.dtype)
 
     def convolve(edge: Array) -> Array:
-        return nn.leaky_relu(edge, LEAKY_SLOPE) @ kernel
+        return product(nn.leaky_relu(edge, LEAKY_SLOPE), kernel)
 
     shift = _mean_over_first_slot(convolve(near[index[:, 0]] + own), weight, index)
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import flax.struct
 import jax
+import jax.numpy as jnp
 import numpy as np
 from flax.traverse_util import flatten_dict, unflatten_dict
 
@@ -46,6 +47,19 @@ def unflatten(arrays: Mapping[str, np.ndarray], config: Any) -> Params:
     """``Params`` on the default device, of the networks that have arrays."""
     leaves = jax.device_put(dict(arrays))  # at once: hundreds of single ones take half a second
     return Params(unflatten_dict(leaves, sep="/"), config)
+
+
+def bfloat16_kernels(networks: Any) -> Any:
+    """The same tree with its kernels in bfloat16, and with them the products (`ops.products`).
+
+    Geometry stays in float32: neighbours, Sinkhorn, poses, what a norm computes, and the layers
+    that are given coordinates. Files hold float32, so this is for what is loaded or trained.
+    """
+
+    def rounded(path: tuple[Any, ...], leaf: Any) -> Any:
+        return leaf.astype(jnp.bfloat16) if path[-1].key == "kernel" else leaf
+
+    return jax.tree_util.tree_map_with_path(rounded, networks)
 
 
 def require_shapes(found: Shapes, expected: Shapes, owner: str, fix: str) -> None:

@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from dbdnet_jax.ops.products import product
+
 
 def attention(
     query: Float[Array, "n d"],
@@ -21,8 +23,9 @@ def attention(
 
     Channels are split into ``heads`` equal groups. With a ``dropout_key``, attention weights are
     dropped at rate ``dropout`` and the others scaled up. Where no row of the other cloud is
-    valid the result is zero. Heads run one after another, and each one's n x m weights are
-    computed again in the derivative instead of being kept.
+    valid the result is zero. Where keys and values are bfloat16, both products are
+    (`ops.products`), but not the softmax between them. Heads run one after another, and each one's
+    n x m weights are computed again in the derivative instead of being kept.
     """
     n, d = query.shape
     width = d // heads
@@ -46,8 +49,8 @@ def _head(
     dropout: float,
 ) -> Float[Array, "n d"]:
     """One head: softmax(q k^T / sqrt(width)) v, with the division left to the n x width result."""
-    present = valid.astype(value.dtype)[:, None]
-    logits = jnp.matmul(query * (1.0 / math.sqrt(query.shape[-1])), key.T)
+    present = valid.astype(query.dtype)[:, None]
+    logits = product(query * (1.0 / math.sqrt(query.shape[-1])), key.T)
     # A large finite number, not -inf: a row of only -inf would give nan. Such a row weighs all
     # masked rows alike, so these are left out of both products below.
     logits = jnp.where(valid[None, :], logits, jnp.finfo(logits.dtype).min)
@@ -56,7 +59,8 @@ def _head(
     if dropout_key is not None:
         kept = jax.random.bernoulli(dropout_key, 1.0 - dropout, weights.shape)
         weights = jnp.where(kept, weights / (1.0 - dropout), 0.0)
-    return jnp.matmul(weights, value * present) / jnp.where(total > 0, total, 1.0)
+    value = value * present.astype(value.dtype)
+    return product(weights, value) / jnp.where(total > 0, total, 1.0)
 
 
 def position_code(points: Float[Array, "n 3"], width: int) -> Float[Array, "n width"]:

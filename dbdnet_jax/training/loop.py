@@ -25,7 +25,12 @@ from dbdnet_jax.training.checkpoint import Checkpoints
 from dbdnet_jax.training.config import stage_defaults, stage_record
 from dbdnet_jax.training.lock import sole_training
 from dbdnet_jax.training.optimizer import make_optimizer, make_schedule
-from dbdnet_jax.training.parallel import mean_over_pairs, on_all_devices, training_mesh
+from dbdnet_jax.training.parallel import (
+    mean_over_pairs,
+    on_all_devices,
+    spread_rows,
+    training_mesh,
+)
 from dbdnet_jax.training.preemption import Preempted, stop_requests
 from dbdnet_jax.training.run_folder import write_stage
 from dbdnet_jax.training.runlog import RunLog
@@ -109,9 +114,11 @@ def run_task(
             optimizer=optimizer,
             batch_size=batch_size,
             mesh=mesh,
+            batched=stream.batched,
             ema_decay=train.ema_decay,
             accumulate=train.accumulate,
             remat=train.remat,
+            precision=train.precision,
         )
         with RunLog(folder, start) as log:
             loop = _Loop(task, stream, train, checkpoints, log, schedule, batch_size, total, mesh)
@@ -147,7 +154,8 @@ class _Loop:
         frozen, pairs, key = on_all_devices(
             self.mesh, (self.task.frozen, self.stream.validation, jax.random.key(train.seed))
         )
-        arrays = _on_all_devices(self.mesh, self.stream.arrays(start))
+        place = spread_rows if self.stream.batched else on_all_devices
+        arrays = _placed(functools.partial(place, self.mesh), self.stream.arrays(start))
         validate = jax.jit(self._mean_validation)
         waiting: list[StepMetrics] = []
         if self.task.networks and self.checkpoints.latest_step() is None:
@@ -264,12 +272,12 @@ def _require_parts(task: Task, pairs: int, parts: int) -> None:
         )
 
 
-def _on_all_devices(mesh: Mesh, arrays: Iterator[Any]) -> Iterator[Any]:
+def _placed(place: Callable[[Any], Any], arrays: Iterator[Any]) -> Iterator[Any]:
     """Each step's arrays where they are needed; what stays the same is moved there once."""
     held = placed = None
     for these in arrays:
         if these is not held:
-            held, placed = these, on_all_devices(mesh, these)
+            held, placed = these, place(these)
         yield placed
 
 

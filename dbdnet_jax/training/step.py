@@ -13,6 +13,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from dbdnet_jax.networks.batch_norm import fold, join_batch_stats
+from dbdnet_jax.networks.params import bfloat16_kernels
 from dbdnet_jax.training.parallel import mean_over_pairs, stack_over_devices
 from dbdnet_jax.types import Pair
 
@@ -75,28 +76,33 @@ def train_step(
     optimizer: optax.GradientTransformation,
     batch_size: int,
     mesh: Mesh,
+    batched: bool = False,
     ema_decay: float = 0.0,
     accumulate: int = 1,
     remat: bool = False,
+    precision: str = "float32",
 ) -> tuple[TrainState, StepMetrics]:
     """One step on ``batch_size`` fresh pairs; pure, so its result depends on the arguments only.
 
+    ``batched`` ``arrays`` are the step's own, with a row for each pair, which ``draw`` is given.
+
     The devices of ``mesh`` share the pairs; on a GPU or TPU each takes its own in ``accumulate``
-    parts, one after another. ``remat`` recomputes the loss for its gradient. ``loss`` is a task's
-    (`training.task`). Where the loss, a term or the gradient is not finite the state comes back as
-    it was, step count included: the same step would be taken again, and fail again, until the
-    caller stops.
+    parts, one after another. ``remat`` recomputes the loss for its gradient; a ``precision`` of
+    "bfloat16" is that of its products. ``loss`` is a task's (`training.task`). Where the loss, a
+    term or the gradient is not finite the state comes back as it was, step count included: the same
+    step would be taken again, and fail again, until the caller stops.
     """
     key = jax.random.fold_in(key, state.step)
+    loss = _with_bfloat16(loss) if precision == "bfloat16" else loss
     loss = jax.checkpoint(loss) if remat else loss
     batch_stats = None
     if state.batch_stats is None:
         total, terms, gradient = _by_pair(
-            state, frozen, key, arrays, draw, loss, batch_size, mesh, accumulate
+            state, frozen, key, arrays, draw, loss, batch_size, mesh, accumulate, batched
         )
     else:
         total, terms, gradient, batch_stats = _by_batch(
-            state, frozen, key, arrays, draw, loss, batch_size, mesh
+            state, frozen, key, arrays, draw, loss, batch_size, mesh, batched
         )
     norm = optax.tree.norm(gradient)
     finite = jnp.isfinite(jnp.stack([total, norm, *jax.tree.leaves(terms)])).all()
@@ -113,6 +119,15 @@ def train_step(
     return state, StepMetrics(total, terms, norm, finite)
 
 
+def _with_bfloat16(loss: Callable[..., Any]) -> Callable[..., Any]:
+    """The loss of rounded kernels; its gradient is one of the kernels as they are."""
+
+    def rounded(trainable: Any, frozen: Any, *rest: Any) -> Any:
+        return loss(bfloat16_kernels(trainable), bfloat16_kernels(frozen), *rest)
+
+    return rounded
+
+
 def _by_pair(
     state: TrainState,
     frozen: Any,
@@ -123,10 +138,11 @@ def _by_pair(
     batch_size: int,
     mesh: Mesh,
     accumulate: int,
+    batched: bool,
 ) -> tuple[Array, Any, Any]:
     """Loss, terms and gradient as means over the pairs, each on its own."""
 
-    def one(i: Array, params: Any, frozen: Any, step: Array, key: PRNGKeyArray, arrays: Any) -> Any:
+    def one(i: Array, arrays: Any, params: Any, frozen: Any, step: Array, key: PRNGKeyArray) -> Any:
         draw_key, loss_key = jax.random.split(jax.random.fold_in(key, i))
         pair = draw(draw_key, step * batch_size + i, arrays)
         return jax.value_and_grad(loss, has_aux=True)(params, frozen, pair, loss_key)
@@ -135,8 +151,9 @@ def _by_pair(
         mesh,
         one,
         batch_size,
-        *(state.params, frozen, state.step, key, arrays),
+        *(arrays, state.params, frozen, state.step, key),
         rounds=accumulate,
+        split=batched,
     )
     return total, terms, gradient
 
@@ -150,12 +167,14 @@ def _by_batch(
     loss: Callable[..., Any],
     batch_size: int,
     mesh: Mesh,
+    batched: bool,
 ) -> tuple[Array, Any, Any, Any]:
     """Loss, terms and gradient of all pairs together, and the new running averages."""
 
     def one(i: Array) -> Pair:
         draw_key, _ = jax.random.split(jax.random.fold_in(key, i))
-        return draw(draw_key, state.step * batch_size + i, arrays)
+        of_pair = jax.tree.map(lambda leaf: leaf[i], arrays) if batched else arrays
+        return draw(draw_key, state.step * batch_size + i, of_pair)
 
     pairs = stack_over_devices(mesh, one, batch_size)
     loss_key = jax.random.fold_in(key, batch_size)

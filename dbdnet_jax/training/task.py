@@ -9,10 +9,12 @@ from typing import Any, NamedTuple
 
 from dbdnet_jax.data.config import DataConfig
 from dbdnet_jax.data.pairs import Protocol
+from dbdnet_jax.networks.table import DEFAULT_METHOD
 
 OPTIMIZERS = ("adamw", "adam")
 LARGEST_BATCH = 2**16  # pairs of a step, all of which are in memory
 SCHEDULES = ("cosine", "constant", "steps")
+PRECISIONS = ("float32", "bfloat16")
 
 
 class Task(NamedTuple):
@@ -56,6 +58,8 @@ class TrainConfig:
     Adam does, "adamw" does not. ``schedule`` "cosine" ends at 0; "steps" multiplies the rate by
     ``factor`` after each of the ``milestones`` (epochs); "constant" falls to 0 by a cosine over the
     last ``decay_epochs`` only, so that such a run may be prolonged or cut short. All may warm up.
+    ``precision`` is that of the networks' products in the loss (`params.bfloat16_kernels`): weights
+    and their average stay in float32, and the validation uses them so.
     """
 
     seed: int = 0
@@ -78,10 +82,15 @@ class TrainConfig:
     devices: int = 0  # that share each batch; 0: all (on a CPU, of one for each core)
     accumulate: int = 1  # parts of a device's share, taken one after another on a GPU or TPU
     remat: bool = False  # recompute the loss for its gradient instead of keeping what it needs
+    precision: str = "float32"  # or "bfloat16"
 
     def __post_init__(self) -> None:
         """Refuse unknown choices, and cadences that do not fit: a resumed log must be unbroken."""
-        for name, choices in (("optimizer", OPTIMIZERS), ("schedule", SCHEDULES)):
+        for name, choices in (
+            ("optimizer", OPTIMIZERS),
+            ("schedule", SCHEDULES),
+            ("precision", PRECISIONS),
+        ):
             if getattr(self, name) not in choices:
                 raise ValueError(
                     f"config.train.{name} must be one of {choices}; got {getattr(self, name)!r}. "
@@ -138,6 +147,14 @@ class RunConfig:
     protocol: Protocol
     train: TrainConfig
     stages: Mapping[str, Any]
+
+    def __post_init__(self) -> None:
+        """Refuse a precision that the method does not know."""
+        if self.method != DEFAULT_METHOD and self.train.precision != "float32":
+            raise ValueError(
+                f"config.train.precision must be 'float32' but for the method {DEFAULT_METHOD}; "
+                f"got {self.train.precision!r} for {self.method}. Use 'float32'."
+            )
 
     def with_stage(self, name: str, **changes: Any) -> RunConfig:
         """The same with fields of one stage's record changed."""

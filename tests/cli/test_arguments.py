@@ -12,7 +12,7 @@ from dbdnet_jax.cli.statuses import UNUSABLE
         (["--jobs", "0"], "must be a whole number from 1 to 4096; got '0'"),
         (["--executor", "ray://x:1"], "must be dask://HOST:PORT; got 'ray://x:1'"),
         (["--jobs", "2", "--executor", "dask://x:1"], "--jobs is for processes of this machine"),
-        (["--results", "answers.txt"], "must be one of .jsonl; got answers.txt"),
+        (["--results", "answers.txt"], "must be one of .jsonl .parquet; got answers.txt"),
     ],
 )
 def test_options_of_no_use_are_refused(tmp_path, capsys, options, message):

@@ -2,6 +2,7 @@
 
 import threading
 
+import jax
 import numpy as np
 import pytest
 
@@ -144,6 +145,28 @@ def test_batches_resume_where_they_stopped(folder):
     other = take(batches(folder, info, **(given | {"seed": 6})), 7)
     motions = zip(whole, other, strict=True)
     assert any((a.target_from_source[1] != b.target_from_source[1]).any() for a, b in motions)
+
+
+def test_a_share_is_read_alone_and_is_its_part_of_the_batches(folder, monkeypatch):
+    info, read = load_info(folder, "train"), []
+
+    def noted(*args, epoch, **kwargs):
+        read.append((epoch, args[2]))
+        return load_pair(*args, epoch=epoch, **kwargs)
+
+    given = dict(batch_size=4, seed=5, points=64, start_step=1)
+    with monkeypatch.context() as patch:
+        patch.setattr(threedmatch, "load_pair", noted)
+        part = take(batches(folder, info, share=(1, 2), **given), 3)
+        found = set(read)
+    whole = take(batches(folder, info, **given), 3)
+    others = set()
+    for step, (a, b) in enumerate(zip(whole, part, strict=True), 1):
+        trees_equal(jax.tree.map(lambda leaf: leaf[2:], a), b)
+        for row, motion in enumerate(a.target_from_source.translation[:2]):
+            i = int(np.abs(info.translation - motion).sum(1).argmin())
+            others.add(((4 * step + row) // len(info), i))
+    assert len(others) == 6 <= len(found) and not found & others
 
 
 def test_every_epoch_holds_every_pair_in_a_new_order_and_draw(folder):

@@ -108,8 +108,17 @@ def test_scans_come_in_batches_and_go_on_where_they_were(tmp_path, monkeypatch):
     batches = [next(first) for _ in range(3)]
     resumed = next(source.arrays(2))
     jax.tree.map(np.testing.assert_array_equal, resumed, batches[2])
-    pair = source.draw(jax.random.key(0), jnp.asarray(5), jax.tree.map(jnp.asarray, batches[2]))
-    jax.tree.map(lambda one, both: np.testing.assert_array_equal(one, both[1]), pair, batches[2])
+    assert source.batched
+    # A row of the batch is the pair.
+    row = jax.tree.map(lambda leaf: jnp.asarray(leaf[1]), batches[2])
+    pair = source.draw(jax.random.key(0), jnp.asarray(5), row)
+    jax.tree.map(np.testing.assert_array_equal, pair, row)
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    monkeypatch.setattr(jax, "process_index", lambda: 1)
+    own = next(source.arrays(2))
+    jax.tree.map(
+        lambda part, whole: np.testing.assert_array_equal(part, whole[1:]), own, batches[2]
+    )
 
 
 def test_a_share_of_the_pairs_is_of_the_mixture():

@@ -39,9 +39,7 @@ class Encoder(nn.Module):
         features = [points if geometry is None else jnp.concatenate([points, geometry], axis=-1)]
         for stage in range(1, LEVELS + 1):
             features = [
-                self._edgeconv(
-                    f"stage{stage}_conv{level + 1}", x, pyramid, level, points if stage == 1 else x
-                )
+                self._edgeconv(stage, level, x, pyramid, points if stage == 1 else x)
                 for level, x in enumerate(features)
             ]
             for level, x in enumerate(features):
@@ -65,14 +63,16 @@ class Encoder(nn.Module):
         return self.channels << level
 
     def _edgeconv(
-        self, name: str, x: jax.Array, pyramid: Pyramid, level: int, place: jax.Array
+        self, stage: int, level: int, x: jax.Array, pyramid: Pyramid, place: jax.Array
     ) -> jax.Array:
         """EdgeConv over rows near in ``place``: coordinates in the first stage, then features."""
         here = pyramid.levels[level]
         index = here.neighbours
         if self.neighbour_space == "feature":
             index = knn(place, place, index.shape[1], here.count)
-        return EdgeConv(self._width(level), GROUPS[level], name=name)(x, index, here.valid)
+        name = f"stage{stage}_conv{level + 1}"
+        layer = EdgeConv(self._width(level), GROUPS[level], of_points=stage == 1, name=name)
+        return layer(x, index, here.valid)
 
     def _exchange(self, stage: str, features: list[jax.Array], pyramid: Pyramid) -> list:
         """Every level adds all others; the next level, if there is one, is opened."""

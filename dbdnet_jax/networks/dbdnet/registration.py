@@ -50,7 +50,8 @@ class ParameterNetwork(nn.Module):
         x = jnp.concatenate([clouds.points, tag], axis=-1).reshape(2 * n, 4)
         valid = clouds.valid.reshape(2 * n)
         for layer, (features, groups) in enumerate(self.config.point_layers):
-            x = DenseNorm(features, groups, name=f"point_{layer}")(x, valid)
+            dense_norm = DenseNorm(features, groups, of_points=layer == 0, name=f"point_{layer}")
+            x = dense_norm(x, valid)
         x = masked_max(x, valid)[None, :]
         for layer, (features, groups) in enumerate(self.config.global_layers):
             x = DenseNorm(features, groups, name=f"global_{layer}")(x, jnp.ones(1, bool))
