@@ -24,19 +24,20 @@ from dbdnet_jax.evaluation.methods import Weights
 from dbdnet_jax.evaluation.run import evaluate
 from dbdnet_jax.evaluation.tables import render, save
 from dbdnet_jax.io.programs import keep_compiled_programs, require_device
-from dbdnet_jax.networks.table import LEARNED
+from dbdnet_jax.networks.table import parts_of
 from dbdnet_jax.networks.weights import save_params
 from dbdnet_jax.training.config import parse_flags, read_config
 from dbdnet_jax.training.loop import fit
 from dbdnet_jax.training.parallel import join_processes
 from dbdnet_jax.training.preemption import Interrupted, Preempted, interrupt_on_signals
-from dbdnet_jax.training.run_folder import JOINT, load_best
+from dbdnet_jax.training.run_folder import load_best
 from dbdnet_jax.training.table import STAGES
+from dbdnet_jax.training.task import RunConfig
 
 CONFIG = config_flags.DEFINE_config_file("config", None, "Configuration file, configs/NAME.py.")
 RUN_DIR = flags.DEFINE_string("run_dir", None, "Where results go; runs/NAME if not given.")
 STAGE = flags.DEFINE_string(
-    "stage", "all", "What to train: a stage of the method, or all (or both) but joint."
+    "stage", "all", "What to train: a stage, or one for each network there is (all, or both)."
 )
 DISTRIBUTED = flags.DEFINE_bool(
     "distributed", False, "One of several processes that train together; see docs/scaling.md."
@@ -47,11 +48,11 @@ PROCESS_ID = flags.DEFINE_integer("process_id", None, "Which of them this is, fr
 EVALUATE = flags.DEFINE_bool("evaluate", True, "Print the table of results at the end.")
 
 
-def stages_of(method: str, stage: str) -> tuple[str, ...]:
-    """The stages of a method that ``--stage`` asks for."""
-    known = STAGES[method]
+def stages_of(config: RunConfig, stage: str) -> tuple[str, ...]:
+    """The stages that ``--stage`` asks for; all of them are those of the networks there are."""
+    method, known = config.method, STAGES[config.method]
     if stage in ("all", "both"):
-        return tuple(name for name in known if name != JOINT)
+        return parts_of(config.model)
     if stage not in known:
         raise ValueError(
             f"--stage must be all, both or one of {', '.join(known)} for the method {method}; got "
@@ -81,7 +82,7 @@ def main(argv: list[str]) -> None:
 def train(run_dir: Path) -> None:
     """`main` between its flags and its errors."""
     config = read_config(CONFIG.value)
-    stages = stages_of(config.method, STAGE.value)
+    stages = stages_of(config, STAGE.value)
     # Before anything asks JAX for a device: the number is fixed from then on. More devices
     # than pairs in a step would have nothing to do.
     pairs = max(stage.batch_size for stage in config.stages.values())
@@ -107,7 +108,7 @@ def train(run_dir: Path) -> None:
     print(f"The best weights are in {run_dir / 'params.npz'}.")
     if jax.process_count() > 1:
         print("Several processes make no table of results; evaluate.py does.")
-    elif EVALUATE.value and set(LEARNED[config.method].parts) <= params.networks.keys():
+    elif EVALUATE.value and set(parts_of(config.model)) <= params.networks.keys():
         evaluation = evaluate(
             [Weights("params", params)],
             load_test_pairs(config.data, config.protocol, run_dir),
