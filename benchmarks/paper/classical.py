@@ -1,7 +1,7 @@
 """Two methods without weights that Open3D does not have: KISS-Matcher and GICP.
 
-Lengths are those of clouds in the unit sphere. Neither is tuned beyond its voxel: that keeps about
-all of 717 points.
+Lengths are those of clouds in the unit sphere. KISS-Matcher's voxel is the best of five, from 0.02
+to 0.1, on 20 validation pairs; GICP's keeps about all of 717 points.
 """
 
 from typing import Any
@@ -11,7 +11,7 @@ import numpy as np
 from dbdnet_jax.errors import MissingExtraError
 from dbdnet_jax.types import OtherPoints, Points, Rigid
 
-VOXEL = 0.05  # KISS-Matcher: its features' radii are 3 and 5 of it
+VOXEL = 0.08  # KISS-Matcher: its features' radii are 3 and 5 of it
 GICP_VOXEL = 0.02
 GICP_DISTANCE = 1.0  # as ICP's: the clouds start up to 1.7 apart
 GICP_ITERATIONS = 200
