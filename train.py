@@ -22,28 +22,29 @@ from dbdnet_jax.data.training_pairs import load_training_pairs
 from dbdnet_jax.evaluation.methods import Weights
 from dbdnet_jax.evaluation.run import evaluate
 from dbdnet_jax.evaluation.tables import render, save
-from dbdnet_jax.networks.table import LEARNED
+from dbdnet_jax.networks.table import parts_of
 from dbdnet_jax.networks.weights import save_params
 from dbdnet_jax.training import launch
 from dbdnet_jax.training.config import parse_flags, read_config
 from dbdnet_jax.training.loop import fit
 from dbdnet_jax.training.preemption import Interrupted, Preempted, interrupt_on_signals
-from dbdnet_jax.training.run_folder import JOINT, load_best
+from dbdnet_jax.training.run_folder import load_best
 from dbdnet_jax.training.table import STAGES
+from dbdnet_jax.training.task import RunConfig
 
 CONFIG = config_flags.DEFINE_config_file("config", None, "Configuration file, configs/NAME.py.")
 RUN_DIR = flags.DEFINE_string("run_dir", None, "Where results go; runs/NAME if not given.")
 STAGE = flags.DEFINE_string(
-    "stage", "all", "What to train: a stage of the method, or all (or both) but joint."
+    "stage", "all", "What to train: a stage, or one for each network there is (all, or both)."
 )
 EVALUATE = flags.DEFINE_bool("evaluate", True, "Print the table of results at the end.")
 
 
-def stages_of(method: str, stage: str) -> tuple[str, ...]:
-    """The stages of a method that ``--stage`` asks for."""
-    known = STAGES[method]
+def stages_of(config: RunConfig, stage: str) -> tuple[str, ...]:
+    """The stages that ``--stage`` asks for; all of them are those of the networks there are."""
+    method, known = config.method, STAGES[config.method]
     if stage in ("all", "both"):
-        return tuple(name for name in known if name != JOINT)
+        return parts_of(config.model)
     if stage not in known:
         raise ValueError(
             f"--stage must be all, both or one of {', '.join(known)} for the method {method}; got "
@@ -73,7 +74,7 @@ def main(argv: list[str]) -> None:
 def train(run_dir: Path) -> None:
     """`main` between its flags and its errors."""
     config = read_config(CONFIG.value)
-    stages = stages_of(config.method, STAGE.value)
+    stages = stages_of(config, STAGE.value)
     most = max(stage.batch_size for stage in config.stages.values())
     launch.start(config.train.devices, most)
     for stage in stages:
@@ -90,7 +91,7 @@ def train(run_dir: Path) -> None:
     if first:
         save_params(run_dir / "params.npz", params)
         print(f"The best weights are in {run_dir / 'params.npz'}.")
-    if EVALUATE.value and set(LEARNED[config.method].parts) <= params.networks.keys():
+    if EVALUATE.value and set(parts_of(config.model)) <= params.networks.keys():
         evaluation = evaluate(
             [Weights("params", params)],
             load_test_pairs(config.data, config.protocol, run_dir),

@@ -9,6 +9,7 @@ choice of neighbours, norms, exponentials, Sinkhorn's sums. A multiply-add is tw
 from itertools import pairwise
 
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
+from dbdnet_jax.networks.dbdnet.dgcnn import WIDTHS
 from dbdnet_jax.networks.dbdnet.matching import FIT_FEATURES
 from dbdnet_jax.ops.pyramid import LEVELS
 
@@ -20,7 +21,7 @@ def register(config: ModelConfig, points: int) -> dict[str, int]:
 
     Every selected point is taken to enter the registration, as in the program's static shapes.
     """
-    parts = overlap(config, points)
+    parts = overlap(config, points) if config.overlap == "prior" else {}
     for name, count in registration(config, points).items():
         parts[name] = parts.get(name, 0) + config.iterations * count
     return {name: config.overlap_passes * count for name, count in parts.items()}
@@ -35,34 +36,41 @@ def overlap(config: ModelConfig, points: int) -> dict[str, int]:
         # Distances of features, those of points, and the soft targets: once for the motion and
         # once for each cloud's features.
         matching = n * n * width + n * n * 3 * 4
-    (first, _), *_ = config.head_layers
-    # The other cloud's pooled feature is the same for all points.
-    head = 2 * (width * first + n * (dense(fan_in, config.head_layers) + config.head_width // 4))
     return {
         "encoder": 2 * encoder(config.overlap_channels, n, config),
         "attention": config.overlap_blocks * attention_block(width, n),
         "matching": matching,
-        "head": head,
+        "head": head(config, fan_in, width, n),
     }
+
+
+def head(config: ModelConfig, fan_in: int, width: int, rows: int) -> int:
+    """The overlap decoder on two clouds; what is pooled of the other one is the same for all."""
+    (first, _), *_ = config.head_layers
+    return 2 * (width * first + rows * (dense(fan_in, config.head_layers) + config.head_width // 4))
 
 
 def registration(config: ModelConfig, points: int) -> dict[str, int]:
     """One iteration of the registration network on two clouds."""
     n, width = min(points, config.registration_points or points), 4 * config.registration_channels
-    blocks = config.shared_blocks + config.rotation_blocks + config.translation_blocks
+    blocks = config.shared_blocks + config.rotation_blocks
+    blocks += config.translation_blocks if config.branches == 2 else 0
     last = config.global_layers[-1][0]
     return {
         "encoder": 2 * encoder(config.registration_channels, n, config),
         "attention": blocks * attention_block(width, n),
-        "matching": 2 * n * n * (width + 3),
+        "matching": config.branches * n * n * (width + 3),
+        "head": head(config, width, width, n) if config.overlap == "joint" else 0,
         "parameters": 2 * n * dense(4, config.point_layers)
         + dense(config.parameter_width, config.global_layers)
-        + 4 * last,
+        + 2 * config.branches * last,
     }
 
 
 def encoder(channels: int, points: int, config: ModelConfig) -> int:
     """The encoder of one cloud."""
+    if config.encoder == "dgcnn":
+        return dgcnn(channels, points, config)
     widths = [channels << level for level in range(LEVELS)]
     rows = [points >> level for level in range(LEVELS)]
     total = 0
@@ -86,6 +94,16 @@ def encoder(channels: int, points: int, config: ModelConfig) -> int:
         if level:  # onto the finest level
             total += rows[level] * widths[level] * channels + 3 * rows[0] * channels
     return total
+
+
+def dgcnn(channels: int, points: int, config: ModelConfig) -> int:
+    """The ablation's encoder of one cloud."""
+    total, fan_in = 3 * points**2, 3
+    for width in (channels * part for part in WIDTHS):
+        total += edge_conv(fan_in, width, points, config.neighbours)
+        total += points**2 * fan_in if config.neighbour_space == "feature" else 0
+        fan_in = width
+    return total + points * sum(WIDTHS) * 4 * channels**2
 
 
 def edge_conv(fan_in: int, width: int, rows: int, neighbours: int) -> int:

@@ -15,6 +15,7 @@ from benchmarks.scaling import by_devices
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.dbdnet.register import register
 from dbdnet_jax.networks.initial import init_params
+from tests.ladder import small_step
 from tests.networks.dbdnet.small import SMALL
 
 N = 64
@@ -48,7 +49,11 @@ def test_the_product_walker_counts_loops():
     assert products(jax.make_jaxpr(thrice)(jnp.ones((4, 4))).jaxpr) == 3 * 4**3
 
 
-@pytest.mark.parametrize("config", [SMALL, LIMITED], ids=["plain", "limits"])
+@pytest.mark.parametrize(
+    "config",
+    [SMALL, LIMITED, small_step("joint_overlap"), small_step("dgcnn")],
+    ids=["plain", "limits", "joint", "dgcnn"],
+)
 def test_the_arithmetic_is_a_little_less_than_what_the_network_multiplies(config):
     params = init_params(jax.random.key(0), config)
     cloud = jnp.zeros((N, 3))

@@ -33,6 +33,7 @@ from dbdnet_jax.training.config import default_config, read_config, stage_record
 from dbdnet_jax.training.losses import LossWeights
 from dbdnet_jax.training.table import STAGES
 from dbdnet_jax.training.task import RunConfig, TrainConfig
+from tests.ladder import LADDER
 
 ROOT = Path(__file__).parents[1]
 CONFIGS = {"modelnet": modelnet, "threedmatch": threedmatch, "cad": cad, "cad_short": cad_short}
@@ -52,6 +53,7 @@ PEERS |= {
     "finet_cad": finet_cad,
     "inenet_cad": inenet_cad,
 }
+ALL = CONFIGS | PEERS | LADDER
 
 
 def train(*arguments: str) -> subprocess.CompletedProcess:
@@ -78,9 +80,9 @@ def with_change(**changes: object) -> ConfigDict:
     return config
 
 
-@pytest.mark.parametrize("name", [*CONFIGS, *PEERS])
+@pytest.mark.parametrize("name", ALL)
 def test_every_configuration_holds_exactly_the_fields_there_are(name):
-    config = (CONFIGS | PEERS)[name].get_config()
+    config = ALL[name].get_config()
     found = read_config(config)
     assert isinstance(found, RunConfig)
     model = LEARNED[found.method].config
@@ -89,10 +91,10 @@ def test_every_configuration_holds_exactly_the_fields_there_are(name):
     assert set(config) - set(found.stages) == {"method", "model", "data", "protocol", "train"}
 
 
-@pytest.mark.parametrize("name", [*CONFIGS, *PEERS])
+@pytest.mark.parametrize("name", ALL)
 def test_configurations_are_locked(name):
     with pytest.raises(AttributeError, match="batchsize"):
-        (CONFIGS | PEERS)[name].get_config().train.batchsize = 4
+        ALL[name].get_config().train.batchsize = 4
 
 
 @pytest.mark.parametrize("method", STAGES)

@@ -63,6 +63,8 @@ def wrong_words(command: str) -> list[str]:
     ]
     if match := re.search(r"python (?:-m ((?:benchmarks|tools)\.\w+)|(\S+)\.py)", command):
         script = ROOT / f"{(match[1] or match[2]).replace('.', '/')}.py"
+        if script.with_suffix("").is_dir():
+            script = script.with_suffix("") / "__main__.py"
         known = flags_of(script)
         problems += [] if script.is_file() else [match[0]]
     elif match := re.match("dbdnet-register", command):

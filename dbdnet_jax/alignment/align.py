@@ -26,6 +26,7 @@ from dbdnet_jax.io.forks import require_own_jax
 from dbdnet_jax.io.point_files import read_point_file
 from dbdnet_jax.io.programs import loading_seconds
 from dbdnet_jax.networks.params import Params
+from dbdnet_jax.networks.table import parts_of
 from dbdnet_jax.networks.weights import load_pretrained
 from dbdnet_jax.ops.transforms import as_transform
 from dbdnet_jax.types import Transform
@@ -166,7 +167,7 @@ def align(
 def _with_threshold(params: Params | None, overlap_threshold: float) -> Params:
     """The network, or that of the package, with a threshold of its own."""
     params = load_pretrained() if params is None else params
-    if params.overlap is None or params.registration is None:
+    if params.registration is None or not set(parts_of(params.config)) <= params.networks.keys():
         raise ValueError("params must hold both networks; one is None. Load a full set of weights.")
     config = dataclasses.replace(params.config, overlap_threshold=float(overlap_threshold))
     return dataclasses.replace(params, config=config)

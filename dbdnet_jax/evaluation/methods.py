@@ -15,7 +15,7 @@ from dbdnet_jax.networks.batch_norm import fold_params
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.initial import init_params
 from dbdnet_jax.networks.params import Params
-from dbdnet_jax.networks.table import learned
+from dbdnet_jax.networks.table import learned, parts_of
 from dbdnet_jax.types import Answer, Cloud, Pair, Rigid
 
 Answering = Callable[[Pair], Answer]
@@ -87,11 +87,12 @@ def learned_methods(params: Params, name: str, seed: int) -> list[Method]:
     Without an overlap network they are given the true overlap, and the name says so.
     """
     method = learned(params.config)
-    missing = [part for part in method.parts if part not in params.networks]
+    parts = parts_of(params.config)
+    missing = [part for part in parts if part not in params.networks]
     untrained = init_params(jax.random.key(seed), params.config)
     ask = from_network
     traits = Traits(learned=True)
-    if missing and missing == [method.parts[0]] and method.predict_given_overlap is not None:
+    if missing and missing == [parts[0]] and method.predict_given_overlap is not None:
         ask, traits, name = (
             from_true_overlap,
             Traits(True, given_overlap=True),

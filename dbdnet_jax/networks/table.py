@@ -22,10 +22,11 @@ class Learned(NamedTuple):
     """All that the rest of the house needs to know of a method.
 
     ``config`` is a frozen dataclass, with a default for every field; it travels with the weights,
-    and its type tells the method. ``parts`` are the networks; the names in ``shapes(config)`` begin
-    with them. ``initial(config)`` gives those parameters that start neither from random numbers
-    nor as a norm does. ``predict_given_overlap`` is for params without their first part: it is
-    told the overlap of both clouds.
+    and its type tells the method. ``parts`` are the networks that there may be (`parts_of`: those
+    of a configuration); the names in ``shapes(config)`` begin with them. ``initial(config)`` gives
+    those parameters that start neither from random numbers nor as a norm does.
+    ``predict_given_overlap`` is for params without their first part: it is told the overlap of both
+    clouds.
     """
 
     title: str  # in tables
@@ -76,6 +77,13 @@ def method_of(config: Any) -> str:
 def learned(config: Any) -> Learned:
     """The method that a configuration is of."""
     return LEARNED[method_of(config)]
+
+
+def parts_of(config: Any) -> tuple[str, ...]:
+    """The networks that a configuration has."""
+    method = learned(config)
+    found = {name.split("/")[0] for name in method.shapes(config)}
+    return tuple(part for part in method.parts if part in found)
 
 
 def parameter_shapes(config: Any, parts: Collection[str] | None = None) -> Shapes:

@@ -56,7 +56,8 @@ class RegistrationConfig:
 
     ``masks`` says which points it is given: those that the overlap network "predicted"; those
     that overlap in "truth"; or "perturbed" ones (`pairs.perturbed_overlap`), with the true ones
-    for validation. The last two need no stage 1.
+    for validation. The last two need no stage 1. Without an overlap network it is given all points,
+    and a joint overlap is trained beside it, by a focal loss of ``overlap_gamma``.
     """
 
     epochs: float = 300.0
@@ -64,6 +65,7 @@ class RegistrationConfig:
     learning_rate: float = 1e-4
     masks: str = "predicted"
     weights: LossWeights = LossWeights()
+    overlap_gamma: float = 4.0
 
     def __post_init__(self) -> None:
         """Refuse a stage of nothing, and masks that there are not."""
@@ -129,10 +131,15 @@ def registration_loss_of(
     pair: Pair,
     key: PRNGKeyArray,
 ) -> tuple[Float[Array, ""], Any]:
-    """The registration network's loss on one pair, given the points that ``stage`` says."""
+    """The registration network's loss on one pair, given the points that ``stage`` says.
+
+    With a joint overlap, that of both: the terms are then `JointTerms`.
+    """
     mask_key, start_key, dropout_key = jax.random.split(key, 3)
     start = initial_pose(start_key, pair) if _from_anywhere(model) else None
-    if stage.masks == "predicted":
+    if model.overlap != "prior":
+        masks = pair.source.valid, pair.target.valid
+    elif stage.masks == "predicted":
         overlap_network = Params({"overlap": frozen}, model)
         masks = predict_overlap_and_matches(overlap_network, pair.source, pair.target, start=start)[
             :2
@@ -144,7 +151,13 @@ def registration_loss_of(
     if start is not None:
         pair = transform_source(pair, start)
     found = _register_given(model, trainable, pair, masks, dropout_key if model.dropout else None)
-    return registration_loss(found, pair, stage.weights)
+    loss, terms = registration_loss(found, pair, stage.weights)
+    if model.overlap != "joint":
+        return loss, terms
+    beside, overlap_terms = overlap_loss(
+        found.src_overlap, found.tgt_overlap, pair, stage.overlap_gamma
+    )
+    return beside + loss, JointTerms(*overlap_terms, *terms)
 
 
 def validate_registration(
@@ -152,17 +165,24 @@ def validate_registration(
 ) -> dict[str, Float[Array, ""]]:
     """Errors of the pose after all turns: behind the overlap network, or given the true overlap."""
     if stage.masks == "predicted":
-        params = Params({"overlap": frozen, "registration": trainable}, model)
+        networks = {"registration": trainable}
+        if frozen is not None:
+            networks["overlap"] = frozen
+        params = Params(networks, model)
         found = register_clouds(params, pair.source, pair.target)
     else:
         truth = pair.source_overlap, pair.target_overlap
         found = _register_given(model, trainable, pair, truth, solves=model.solves)
     errors = motion_errors(found.motion, pair.target_from_source)
-    return {
+    figures = {
         "error": errors.rotation_deg,
         "translation_error": errors.translation,
         "loss": registration_loss(found, pair, stage.weights)[0],
     }
+    if model.overlap == "joint":
+        counts = pair_confusion(found.src_overlap, found.tgt_overlap, pair)
+        figures["overlap_error"] = overlap_error(counts)
+    return figures
 
 
 def _register_given(

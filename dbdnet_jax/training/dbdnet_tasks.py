@@ -25,7 +25,12 @@ NETWORKS = ("overlap", "registration")
 
 
 def overlap_task(config: RunConfig, run_dir: str | Path) -> Task:
-    """Stage 1, from fresh weights or ``config.train.start``."""
+    """Stage 1, from fresh weights or ``config.train.start``.
+
+    Raises:
+        ValueError: the configuration has no overlap network.
+    """
+    _require_overlap_network(config, "overlap")
     settings = config.model, config.stages["overlap"].gamma
     return Task(
         initial_params(config).overlap,
@@ -39,10 +44,19 @@ def registration_task(config: RunConfig, run_dir: str | Path) -> Task:
     """Stage 2, from fresh weights or ``config.train.start``.
 
     Raises:
+        ValueError: masks of the truth for a network that is given all points.
         CheckpointError: predicted masks, and no trained overlap network in ``run_dir``.
     """
     stage = config.stages["registration"]
-    frozen = trained_overlap(config.model, run_dir) if stage.masks == "predicted" else None
+    prior = config.model.overlap == "prior"
+    if not prior and stage.masks != "predicted":
+        raise ValueError(
+            "config.registration.masks must be 'predicted' unless config.model.overlap is 'prior': "
+            f"any other network is given all points; got {stage.masks!r} for "
+            f"{config.model.overlap!r}. Change one of the two."
+        )
+    masked = prior and stage.masks == "predicted"
+    frozen = trained_overlap(config.model, run_dir) if masked else None
     radius = config.protocol.overlap_radius
     return Task(
         initial_params(config).registration,
@@ -56,8 +70,10 @@ def joint_task(config: RunConfig, run_dir: str | Path) -> Task:
     """Both networks further.
 
     Raises:
+        ValueError: there is one network only.
         CheckpointError: they are neither in ``run_dir`` nor in ``config.train.start``.
     """
+    _require_overlap_network(config, "joint")
     settings = config.stages["overlap"].gamma, config.stages["registration"].weights
     return Task(
         both_trained(config, run_dir),
@@ -66,6 +82,14 @@ def joint_task(config: RunConfig, run_dir: str | Path) -> Task:
         functools.partial(validate_joint, config.model),
         NETWORKS,
     )
+
+
+def _require_overlap_network(config: RunConfig, stage: str) -> None:
+    if config.model.overlap != "prior":
+        raise ValueError(
+            f"the {stage} stage trains an overlap network, which only config.model.overlap='prior' "
+            f"has; got {config.model.overlap!r}. Train with --stage=registration or all."
+        )
 
 
 def both_trained(config: RunConfig, run_dir: str | Path) -> dict[str, Any]:

@@ -11,6 +11,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "overlap_channels": (4, 1024),  # 16 times the paper's: weights of ten gigabytes
     "overlap_blocks": (0, 64),  # the paper's is 4; every block is traced and compiled on its own
     "registration_channels": (4, 1024),
+    "branches": (1, 2),
     "shared_blocks": (0, 64),
     "rotation_blocks": (0, 64),
     "translation_blocks": (0, 64),
@@ -28,6 +29,12 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "iterations": (1, 64),
     "sinkhorn_iterations": (1, 1024),
 }
+# What a field of text may be; the first is the paper's network.
+_CHOICES = {
+    "encoder": ("multiresolution", "dgcnn"),
+    "overlap": ("prior", "joint", "none"),
+    "neighbour_space": ("feature", "coordinates"),
+}
 
 
 @dataclass(frozen=True)
@@ -36,8 +43,17 @@ class ModelConfig:
 
     ``released=True`` follows the authors' code where it departs from the paper, so that their
     weights give their numbers; each departure is marked at its line.
+
+    The first three fields take the paper's network apart, as its ablations do. A "prior" overlap
+    is predicted by the overlap network before anything is matched; a "joint" one by the
+    registration network, from the features that it matches all points by; with "none" all points
+    are matched. A single branch, of the shared and the rotation blocks, gives rotation and
+    translation in one solve.
     """
 
+    encoder: str = "multiresolution"  # or "dgcnn": four layers on all points, of both networks
+    branches: int = 2
+    overlap: str = "prior"  # or "joint" or "none": then there is no overlap network
     overlap_channels: int = 64  # encoder width at the finest level; its feature is 4 x as wide
     overlap_blocks: int = 4
     overlap_matching: bool = False  # whether the overlap head sees soft matches: not in the paper
@@ -69,11 +85,11 @@ class ModelConfig:
         """
         for field in fields(self):
             check_field(field.name, getattr(self, field.name), type(field.default))
-        if self.neighbour_space not in ("feature", "coordinates"):
-            raise ValueError(
-                "neighbour_space must be 'feature' or 'coordinates'; "
-                f"got {self.neighbour_space!r}. Use one of the two."
-            )
+        for name, choices in _CHOICES.items():
+            if getattr(self, name) not in choices:
+                raise ValueError(
+                    f"{name} must be one of {choices}; got {getattr(self, name)!r}. Choose one."
+                )
         self._check_widths()
         self._check_combinations()
 
@@ -109,6 +125,13 @@ class ModelConfig:
                 "between passes while the overlap network is trained alone; got "
                 f"{self.overlap_passes}. Set overlap_matching=True."
             )
+        for name in ("encoder", "branches", "overlap"):
+            value, whole = getattr(self, name), getattr(ModelConfig, name)
+            if self.released and value != whole:
+                raise ValueError(
+                    f"{name} must be {whole!r} where released=True: the released network is the "
+                    f"paper's whole one; got {value!r}. Set one of the two otherwise."
+                )
         for name in ("overlap_points", "registration_points"):
             points = getattr(self, name)
             if points and self.released:
@@ -122,6 +145,11 @@ class ModelConfig:
                 f"local_geometry must be from 0 to {len(RADII)} radii, and 0 where released=True "
                 f"(the released network has no such input); got {self.local_geometry}, released="
                 f"{self.released}. Use 0."
+            )
+        if self.overlap_matching and self.overlap != "prior":
+            raise ValueError(
+                "overlap_matching must be False unless overlap='prior': it is a part of the "
+                f"overlap network; got True for {self.overlap!r}. Set it to False."
             )
         if self.overlap_matching and self.released:
             raise ValueError(

@@ -6,6 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dbdnet_jax.networks.blocks import Exchange, exchange_shapes
+from dbdnet_jax.networks.dbdnet.config import ModelConfig
+from dbdnet_jax.networks.dbdnet.dgcnn import DGCNN, dgcnn_shapes
 from dbdnet_jax.networks.edgeconv import EdgeConv, edgeconv_shapes
 from dbdnet_jax.networks.params import Shapes
 from dbdnet_jax.ops.grouping import knn
@@ -97,7 +99,19 @@ class Encoder(nn.Module):
         return result
 
 
-def encoder_shapes(name: str, channels: int, inputs: int) -> Shapes:
+def make_encoder(config: ModelConfig, channels: int, name: str | None = None) -> nn.Module:
+    """The encoder of this width that a configuration has."""
+    kind = DGCNN if config.encoder == "dgcnn" else Encoder
+    return kind(channels, config.neighbour_space, name=name)
+
+
+def encoder_shapes(name: str, config: ModelConfig, channels: int) -> Shapes:
+    """The parameters of `make_encoder`."""
+    shapes = dgcnn_shapes if config.encoder == "dgcnn" else _multiresolution_shapes
+    return shapes(name, channels, config.inputs)
+
+
+def _multiresolution_shapes(name: str, channels: int, inputs: int) -> Shapes:
     """The parameters of an `Encoder` that is given so many numbers of each point."""
     widths = [channels << level for level in range(LEVELS)]
     shapes: Shapes = {}

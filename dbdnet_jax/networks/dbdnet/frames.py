@@ -8,7 +8,13 @@ from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.ops import rigid
 from dbdnet_jax.ops.local_geometry import local_geometry
 from dbdnet_jax.ops.rigid import HIGHEST
-from dbdnet_jax.ops.sampling import divisor, farthest_order, inverse_order, prefix_order
+from dbdnet_jax.ops.sampling import (
+    divisor,
+    farthest_order,
+    inverse_order,
+    prefix_mask,
+    prefix_order,
+)
 from dbdnet_jax.types import Cloud, Rigid
 
 FEWEST_ROWS = 8  # of a stack: the coarsest of four levels has one row
@@ -96,6 +102,23 @@ def truncate_rows(clouds: Cloud, limit: int) -> Cloud:
     if not limit:
         return clouds
     return Cloud(clouds.points[:, :limit], jnp.minimum(clouds.count, limit))
+
+
+def select(
+    probability: Float[Array, " n"], count: Int[Array, ""], threshold: float, at_least: int
+) -> tuple[Int[Array, " n"], Int[Array, ""]]:
+    """Row order and count of the points that enter registration.
+
+    The rows above the threshold in their given order or, where fewer than ``at_least`` pass, the
+    ``at_least`` most probable ones in descending order (the released code's rule for a batch of
+    one, here for any batch).
+    """
+    probability = jnp.where(prefix_mask(probability.shape[0], count), probability, -1.0)
+    keep = probability > threshold
+    enough = jnp.sum(keep) >= at_least
+    order = jnp.where(enough, prefix_order(keep), jnp.argsort(-probability, stable=True))
+    kept = jnp.sum(keep).astype(jnp.result_type(count))
+    return order, jnp.where(enough, kept, jnp.minimum(at_least, count))
 
 
 def move_source(clouds: Cloud, motion: Rigid) -> Cloud:

@@ -14,7 +14,9 @@ from dbdnet_jax.types import Answer, Cloud
 
 
 def shapes(config: ModelConfig) -> Shapes:
-    """Shape of every parameter of both networks."""
+    """Shape of every parameter of the networks that the configuration has."""
+    if config.overlap != "prior":
+        return registration_shapes(config)
     return overlap_shapes(config) | registration_shapes(config)
 
 
@@ -26,8 +28,10 @@ def initial(config: ModelConfig) -> dict[str, np.ndarray]:
 
 
 def predict(params: Params, source: Cloud, target: Cloud) -> Answer:
-    """`register` of two clouds, and the overlap it found."""
+    """`register` of two clouds, and the overlap it predicts, if any."""
     found = register_clouds(params, source, target)
+    if params.config.overlap == "none":
+        return Answer(found.motion)
     return Answer(found.motion, found.src_overlap, found.tgt_overlap)
 
 

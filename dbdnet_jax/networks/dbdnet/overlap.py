@@ -3,7 +3,7 @@
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from dbdnet_jax.networks.blocks import (
     Affine,
@@ -16,7 +16,7 @@ from dbdnet_jax.networks.blocks import (
     over_clouds,
 )
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
-from dbdnet_jax.networks.dbdnet.encoder import Encoder, encoder_shapes
+from dbdnet_jax.networks.dbdnet.encoder import encoder_shapes, make_encoder
 from dbdnet_jax.networks.dbdnet.matching import (
     FIT_FEATURES,
     MatchingLayer,
@@ -51,9 +51,9 @@ class OverlapNetwork(nn.Module):
         Without a ``dropout_key`` the network is deterministic.
         """
         config = self.config
-        encoder = Encoder(config.overlap_channels, config.neighbour_space, name="encoder")
+        encoder = make_encoder(config, config.overlap_channels, "encoder")
         features = over_clouds(encoder, clouds.points, pyramids, geometry)
-        n, width = features.shape[1:]
+        width = features.shape[-1]
         features = features + jax.vmap(lambda x: position_code(x, width))(clouds.points)
         valid = clouds.valid
         keys = [None] * config.overlap_blocks
@@ -62,28 +62,61 @@ class OverlapNetwork(nn.Module):
         for block, key in enumerate(keys):
             attend = AttentionBlock(config.heads, config.dropout, name=f"attention_{block}")
             features = attend(features, valid, key)
-        pooled = jax.vmap(masked_max)(features, valid)[::-1]  # of the other cloud
-        other = jnp.broadcast_to(pooled[:, None, :], features.shape)
-        seen, matched = [features, other], None
+        matched, fit = None, []
         if config.overlap_matching:
             matched = MatchingLayer(config.sinkhorn_iterations, name="matching")(clouds, features)
-            seen.append(match_features(matched))
-        features = jnp.concatenate(seen, axis=-1)
-        for layer, (size, groups) in enumerate(config.head_layers):
-            decode = DenseNorm(size, groups, name=f"decoder_{layer}")
-            features = over_clouds(decode, features, valid)
-        logits = dense(Affine(1, name="linear"), features.reshape(2 * n, -1)).reshape(2, n)
-        return logits, matched
+            fit = [match_features(matched)]
+        return decode_overlap(config, features, valid, *fit), matched
+
+
+def decode_overlap(
+    config: ModelConfig,
+    features: Float[Array, "2 n d"],
+    valid: Bool[Array, "2 n"],
+    *more: Float[Array, "2 n f"],
+) -> Float[Array, "2 n"]:
+    """Overlap logits from each point's feature, the other cloud's pooled one, and ``more``.
+
+    For a compact method, whose module the layers become part of.
+    """
+    pooled = jax.vmap(masked_max)(features, valid)[::-1]  # of the other cloud
+    other = jnp.broadcast_to(pooled[:, None, :], features.shape)
+    features = jnp.concatenate([features, other, *more], axis=-1)
+    for layer, (size, groups) in enumerate(config.head_layers):
+        decode = DenseNorm(size, groups, name=f"decoder_{layer}")
+        features = over_clouds(decode, features, valid)
+    n = features.shape[1]
+    return dense(Affine(1, name="linear"), features.reshape(2 * n, -1)).reshape(2, n)
+
+
+class OverlapHead(nn.Module):
+    """`decode_overlap` of a network that does not end there."""
+
+    config: ModelConfig
+
+    @nn.compact
+    def __call__(
+        self, features: Float[Array, "2 n d"], valid: Bool[Array, "2 n"]
+    ) -> Float[Array, "2 n"]:
+        """Logits of the points of two stacked clouds."""
+        return decode_overlap(self.config, features, valid)
 
 
 def overlap_shapes(config: ModelConfig) -> Shapes:
     """The parameters of an `OverlapNetwork`."""
     width = 4 * config.overlap_channels
-    shapes = encoder_shapes("overlap/encoder", config.overlap_channels, config.inputs)
+    shapes = encoder_shapes("overlap/encoder", config, config.overlap_channels)
     shapes |= attention_shapes("overlap/attention", config.overlap_blocks, width)
-    fan_in = 2 * width
+    fit = 0
     if config.overlap_matching:
         shapes |= matching_shapes("overlap/matching")
-        fan_in += FIT_FEATURES
-    shapes |= dense_norm_shapes("overlap/decoder", fan_in, config.head_layers)
-    return shapes | affine_shapes("overlap/linear", config.head_layers[-1][0], 1)
+        fit = FIT_FEATURES
+    return shapes | decoder_shapes("overlap", config, 2 * width + fit)
+
+
+def decoder_shapes(name: str, config: ModelConfig, fan_in: int) -> Shapes:
+    """The parameters of `decode_overlap`, given so many numbers of each point."""
+    return {
+        **dense_norm_shapes(f"{name}/decoder", fan_in, config.head_layers),
+        **affine_shapes(f"{name}/linear", config.head_layers[-1][0], 1),
+    }

@@ -10,6 +10,7 @@ from dbdnet_jax.networks.dbdnet.frames import (
     move_source,
     pad_rows,
     reordered,
+    select,
     stack_clouds,
     stack_masked,
     uncentred,
@@ -23,7 +24,7 @@ from dbdnet_jax.networks.dbdnet.overlap_pass import (
 )
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.ops import rigid
-from dbdnet_jax.ops.sampling import inverse_order, prefix_mask, prefix_order
+from dbdnet_jax.ops.sampling import inverse_order
 from dbdnet_jax.types import Branch, Cloud, Registration, Rigid
 
 
@@ -42,14 +43,19 @@ def register(
     `ModelConfig.overlap_passes` both networks take turns, each time on the clouds as aligned so
     far. Coordinates are expected at the scale the weights were trained at (the unit sphere for the
     CAD and ModelNet40 weights). Where nothing can be estimated ``valid`` is False and the motion
-    the identity.
+    the identity. Without an overlap network all points go to the registration network; where no
+    overlap is predicted at all, that of every point is 1.
 
     Raises:
       ValueError: clouds of no or one row, or parameters of the overlap network alone.
     """
-    _require_both(params, src, tgt)
+    _require_networks(params, src, tgt)
     clouds, order = stack_masked(src, tgt, src_mask, tgt_mask)
     sizes = src.shape[0], tgt.shape[0]
+    if params.config.overlap != "prior":
+        everywhere = clouds.valid.astype(clouds.points.dtype)
+        geometry = geometry_of(clouds, params.config)
+        return _register(params, clouds, order, everywhere, sizes, geometry)
     prepared = prepare_pair(params.config, clouds)
     start = rigid.identity(clouds.points.dtype)
     if params.config.overlap_passes == 1:
@@ -83,7 +89,7 @@ def register(
     )
 
 
-def _require_both(params: Params, src: jax.Array, tgt: jax.Array) -> None:
+def _require_networks(params: Params, src: jax.Array, tgt: jax.Array) -> None:
     """Refuse half a network, and clouds without neighbours."""
     if params.registration is None:
         raise ValueError(
@@ -128,7 +134,15 @@ def predict_overlap_and_matches(
     With a ``start``, a first idea of the motion, one pass from there. Otherwise
     `ModelConfig.overlap_passes` from the clouds with their centroids aligned, each from the motion
     that the matches of the one before ask for.
+
+    Raises:
+      ValueError: parameters without an overlap network.
     """
+    if params.overlap is None:
+        raise ValueError(
+            "predict_overlap needs an overlap network; these params hold only the registration "
+            "network. Use register, whose answer has a joint overlap where there is one."
+        )
     prepared = prepare_pair(params.config, stack_clouds(source, target))
 
     def one_pass(motion: Rigid, _: None) -> tuple[Rigid, tuple[Array, SoftMatches | None]]:
@@ -159,8 +173,8 @@ def register_given_overlap(
     """The registration network alone, on the points whose given overlap passes the threshold.
 
     Stage 2 of training, and the way to use a mask of one's own: 0 and 1 are probabilities too.
-    It matches and solves ``solves`` times, each time on the clouds as aligned so far; as often as
-    `ModelConfig.iterations` says, if None.
+    A joint overlap is then predicted of those. It matches and solves ``solves`` times, each time on
+    the clouds as aligned so far; as often as `ModelConfig.iterations` says, if None.
     """
     clouds = stack_clouds(source, target)
     sizes = (source.points.shape[0], target.points.shape[0])
@@ -169,23 +183,6 @@ def register_given_overlap(
     probability = jnp.stack([pad_rows(source_overlap, size), pad_rows(target_overlap, size)])
     geometry = geometry_of(clouds, params.config)
     return _register(params, clouds, order, probability, sizes, geometry, dropout_key, solves)
-
-
-def select(
-    probability: Float[Array, " n"], count: Int[Array, ""], threshold: float, at_least: int
-) -> tuple[Int[Array, " n"], Int[Array, ""]]:
-    """Row order and count of the points that enter registration.
-
-    The rows above the threshold in their given order or, where fewer than ``at_least`` pass, the
-    ``at_least`` most probable ones in descending order (the released code's rule for a batch of
-    one, here for any batch).
-    """
-    probability = jnp.where(prefix_mask(probability.shape[0], count), probability, -1.0)
-    keep = probability > threshold
-    enough = jnp.sum(keep) >= at_least
-    order = jnp.where(enough, prefix_order(keep), jnp.argsort(-probability, stable=True))
-    kept = jnp.sum(keep).astype(jnp.result_type(count))
-    return order, jnp.where(enough, kept, jnp.minimum(at_least, count))
 
 
 def _register(
@@ -204,33 +201,37 @@ def _register(
         lambda p, c: select(p, c, config.overlap_threshold, config.min_points)
     )(jax.lax.stop_gradient(probability), clouds.count)
     kept = Cloud(jnp.take_along_axis(clouds.points, chosen[..., None], axis=1), count)
-    motion, correspondence, targets, sampled, solvable = iterate(
+    solved = iterate(
         params, kept, reordered(geometry, chosen), dropout_key, solves or config.iterations
     )
-    seen = targets.shape[1]
-    count = jnp.minimum(count, seen)
-    beyond = kept.points.shape[1] - seen
-    correspondence = jnp.pad(correspondence, ((0, 0), (0, beyond), (0, beyond)))
-    targets = jnp.pad(targets, ((0, 0), (0, beyond), (0, 0)))
-    # Row r of the network is row `back[c, r]` of the caller's cloud c.
-    back = jnp.take_along_axis(jnp.take_along_axis(order, chosen, axis=1), sampled, axis=1)
+    matrix, matched, _ = solved.matches
+    beyond = kept.points.shape[1] - matched.shape[1]
+    correspondence = jnp.pad(matrix, ((0, 0), (0, beyond), (0, beyond)))
+    targets = jnp.pad(solved.targets, ((0, 0), (0, beyond), (0, 0)))
+    matched = jnp.pad(matched, ((0, 0), (0, beyond)))
+    # Row r of the network is row `from_stack[c, r]` of the stack and `back[c, r]` of the caller's
+    # cloud c.
+    from_stack = jnp.take_along_axis(chosen, solved.order, axis=1)
+    back = jnp.take_along_axis(order, from_stack, axis=1)
     from_caller = jax.vmap(inverse_order)(back)
     rows, columns = from_caller[0, : sizes[0]], from_caller[1, : sizes[1]]
-    count = count.astype(rows.dtype)
+    if solved.overlap is not None:
+        found = jnp.where(kept.valid, jax.nn.sigmoid(solved.overlap), 0.0)
+        probability = jnp.take_along_axis(found, jax.vmap(inverse_order)(from_stack), axis=1)
     branches = [
         Branch(matrix[rows][:, columns], target[rows], jnp.sum(matrix, axis=1)[rows])
         for matrix, target in zip(correspondence, targets, strict=True)
     ]
     overlap = jnp.take_along_axis(probability, jax.vmap(inverse_order)(order), axis=1)
-    solvable = solvable & jnp.all(count >= 3)
-    motion = _identity_unless(solvable, motion)
+    solvable = solved.determined & jnp.all(jnp.sum(matched, axis=1) >= 3)
+    motion = _identity_unless(solvable, solved.motion)
     return Registration(
         rotation=motion.rotation,
         translation=motion.translation,
         src_overlap=overlap[0, : sizes[0]],
         tgt_overlap=overlap[1, : sizes[1]],
-        src_kept=rows < count[0],
-        tgt_kept=columns < count[1],
+        src_kept=matched[0][rows],
+        tgt_kept=matched[1][columns],
         rotation_branch=branches[0],
         translation_branch=branches[1],
         confidence=0.5 * (branches[0].confidence + branches[1].confidence),

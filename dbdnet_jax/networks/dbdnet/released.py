@@ -35,6 +35,9 @@ _UNUSED = ("self_attention.", "self_layer_norm.", "cross_attention.", "cross_lay
 _FIXED = {
     name: getattr(ModelConfig(), name)
     for name in (
+        "encoder",
+        "branches",
+        "overlap",
         "neighbour_space",
         "heads",
         "head_width",

@@ -12,6 +12,7 @@ import pytest
 from configs import modelnet
 from dbdnet_jax.networks.dbdnet import iterations as solving
 from dbdnet_jax.networks.dbdnet.register import predict_overlap, register_given_overlap
+from dbdnet_jax.networks.dbdnet.registration import Matches
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.ops.sampling import farthest_order
 from dbdnet_jax.training import dbdnet as stages
@@ -54,7 +55,7 @@ class StandIn:
             return clouds.points
         row, column = (jnp.arange(clouds.points.shape[1]) < count for count in clouds.count)
         valid = (row[:, None] & column[None]).astype(clouds.points.dtype)
-        return jnp.stack(matches(clouds.points, second, valid))
+        return Matches(jnp.stack(matches(clouds.points, second, valid)), clouds.valid, None)
 
 
 def registered(released: bool, iterations: int):

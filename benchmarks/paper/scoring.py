@@ -1,0 +1,156 @@
+"""Weights and methods scored on test pairs, and the files that keep what was scored."""
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from benchmarks.machine import record
+from benchmarks.paper.classical import gicp, kiss_matcher
+from benchmarks.paper.recipes import RECIPES, run_folder, seeds
+from benchmarks.paper.training import POINTS
+from dbdnet_jax.data.cad import cad_split
+from dbdnet_jax.data.frozen import CAD_VARIANTS, cad_test_pairs
+from dbdnet_jax.data.symmetry import symmetric_shapes
+from dbdnet_jax.data.test_pairs import PairSet
+from dbdnet_jax.evaluation.methods import Method, Traits, from_network, from_points, make_methods
+from dbdnet_jax.evaluation.run import Row, evaluate_method
+from dbdnet_jax.io.files import write_atomic
+from dbdnet_jax.metrics.pose import summarise
+from dbdnet_jax.networks.params import Params
+from dbdnet_jax.networks.weights import load_params
+
+SETS = ("noise", "clean", "disjoint")
+RESULTS = Path(__file__).parents[1] / "results" / "paper_cad"
+Figures = dict[str, Any]
+
+
+def frozen_set(variant: str) -> PairSet:
+    """A frozen set of pairs of the embedded test shapes."""
+    pairs, digest = cad_test_pairs(variant)
+    shapes = cad_split("test", CAD_VARIANTS[variant][1])
+    symmetric = symmetric_shapes(shapes.points)[np.arange(len(pairs.source.count)) % len(shapes)]
+    return PairSet(f"cad_test_{variant}", pairs, digest, symmetric=symmetric)
+
+
+def first(test: PairSet, count: int | None) -> PairSet:
+    """The first pairs of a set; its hash stays that of the whole."""
+    if count is None or count >= len(test.pairs.source.count):
+        return test
+    return test._replace(
+        name=f"{test.name}_first_{count}",
+        pairs=jax.tree.map(lambda leaf: leaf[:count], test.pairs),
+        symmetric=None if test.symmetric is None else test.symmetric[:count],
+        scans=test.scans and test.scans.first(count),
+    )
+
+
+def figures(method: Method, test: PairSet) -> Figures:
+    """All that the tables show of a method on one set, as plain values."""
+    row = evaluate_method(method, test.pairs, test.scans)
+    found: Figures = {"set": test.name, "sha256": test.digest}
+    if row.note:
+        return found | {"note": row.note}
+    found["seconds_per_pair"] = row.seconds_per_pair
+    if row.overlap is not None:
+        found["overlap"] = row.overlap._asdict()
+    return found | _poses(row, test)
+
+
+def _poses(row: Row, test: PairSet) -> Figures:
+    if row.summary is None or row.errors is None:
+        return {}
+    found: Figures = {"all": row.summary._asdict()}
+    if row.point_distance is not None:
+        found["point_distance"] = float(row.point_distance.mean())
+    if test.symmetric is not None:
+        for kind, chosen in (("plain", ~test.symmetric), ("symmetric", test.symmetric)):
+            if chosen.any():
+                errors = jax.tree.map(lambda leaf, chosen=chosen: leaf[chosen], row.errors)
+                found[kind] = summarise(errors)._asdict()
+    return found
+
+
+def of_params(title: str, params: Params) -> Method:
+    """Weights as a method."""
+    return Method(title, from_network(params), Traits(learned=True))
+
+
+def classical_methods() -> dict[str, Method]:
+    """The methods without weights, by the names of their files."""
+    more = [Method("KISS-Matcher", from_points(kiss_matcher)), Method("GICP", from_points(gicp))]
+    methods = [*make_methods([], seed=0), *more]
+    return {
+        "_".join(method.name.lower().replace(",", "").replace("-", " ").split()): method
+        for method in methods
+    }
+
+
+def score_runs(
+    names: Iterable[str],
+    runs: Path,
+    seed_count: int,
+    sets: Mapping[str, PairSet],
+    results: Path = RESULTS,
+) -> None:
+    """Score every run's parameters that its method's file does not hold yet."""
+    for name in names:
+        recipe = RECIPES[name]
+        held = read_row(results, name) or {"method": recipe.title or recipe.step, "seeds": {}}
+        changed = False
+        for seed in seeds(recipe, seed_count):
+            folder = run_folder(runs, name, seed)
+            for point in POINTS:
+                path = folder / f"{point}.npz"
+                if not path.exists():
+                    continue
+                digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+                points = held["seeds"].setdefault(str(seed), {})
+                if _complete(points.get(point, {}), digest, sets):
+                    continue
+                spent = folder / f"{point}.json"
+                method = of_params(name, load_params(path))
+                points[point] = {
+                    "weights": digest,
+                    "spent": json.loads(spent.read_text()) if spent.exists() else None,
+                    "sets": {key: figures(method, test) for key, test in sets.items()},
+                }
+                changed = True
+        if changed:
+            write_row(results, name, held)
+
+
+def score_classical(sets: Mapping[str, PairSet], results: Path = RESULTS) -> None:
+    """Score the methods without weights that have no file yet."""
+    for name, method in classical_methods().items():
+        held = read_row(results, name)
+        if held is None or not _complete(held, None, sets):
+            found = {key: figures(method, test) for key, test in sets.items()}
+            if not any("note" in figure for figure in found.values()):
+                write_row(results, name, {"method": method.name, "sets": found})
+
+
+def _complete(held: Figures, digest: str | None, sets: Mapping[str, PairSet]) -> bool:
+    scored = held.get("sets", {})
+    return held.get("weights") == digest and all(
+        (scored.get(key, {}).get("set"), scored.get(key, {}).get("sha256"))
+        == (test.name, test.digest)
+        for key, test in sets.items()
+    )
+
+
+def read_row(results: Path, name: str) -> Figures | None:
+    """What is kept of a method; None where there is nothing."""
+    path = results / f"{name}.json"
+    return json.loads(path.read_text()) if path.exists() else None
+
+
+def write_row(results: Path, name: str, held: Figures) -> None:
+    """Keep it, with what it was measured on and by which command."""
+    results.mkdir(parents=True, exist_ok=True)
+    text = json.dumps({**held, "measured": record("benchmarks.paper", {})}, indent=1)
+    write_atomic(results / f"{name}.json", (text + "\n").encode())

@@ -1,0 +1,110 @@
+"""One method trained by `train.py`: for a number of pairs, and on to a time of one core.
+
+Each stage has an equal part of either budget. The time is what the child processes used of the CPU,
+compilation and validation included. The rate is constant, so that what is trained on is the same
+run: its parameters after the pairs are kept as ``pairs.npz``, after the minutes as ``minutes.npz``,
+and a point that is there is not trained again.
+"""
+
+import json
+import resource
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.paper.recipes import Recipe, configuration, stages
+from dbdnet_jax.data.cad import cad_split
+from dbdnet_jax.io.files import write_atomic
+
+POINTS = ("pairs", "minutes")
+CADENCE = 400  # pairs from one validation, and checkpoint, to the next
+LOGGED = 200  # pairs from one row of the log to the next
+STARTING_S = 40  # of a first call that are no training
+STARTING_AGAIN_S = 15  # of a later one, whose programs are compiled already
+
+Run = Callable[[Sequence[str]], float]  # a command line's CPU seconds
+
+
+def train(
+    recipe: Recipe, seed: int, folder: Path, *, pairs: int, minutes: float, run: Run | None = None
+) -> None:
+    """Train to both points whatever is not there yet."""
+    config = configuration(recipe)
+    names = stages(config)
+    seen, seconds = _read(folder)
+    for point in POINTS:
+        if (folder / f"{point}.npz").exists():
+            continue
+        for stage in names:
+            budget = pairs // len(names)
+            if point == "minutes":
+                budget = affordable(
+                    seen.get(stage, budget), seconds.get(stage, 0.0), 60 * minutes / len(names)
+                )
+            if budget <= seen.get(stage, 0):
+                continue
+            batch = config.stages[stage].batch_size
+            line = command(recipe, seed, folder, stage, batch, budget)
+            seconds[stage] = seconds.get(stage, 0.0) + (run or _cpu_seconds)(line)
+            seen[stage] = budget
+            _write(folder, seen, seconds)
+        shutil.copyfile(folder / "params.npz", folder / f"{point}.npz")
+        write_atomic(folder / f"{point}.json", json.dumps(spent(folder)).encode())
+
+
+def affordable(pairs: int, seconds: float, budget_s: float) -> int:
+    """How many pairs a stage can have seen at the end of its time, by its rate so far."""
+    rate = pairs / max(seconds - STARTING_S, 1)
+    left = budget_s - seconds - STARTING_AGAIN_S
+    return pairs + max(0, int(rate * left / CADENCE) * CADENCE)
+
+
+def command(
+    recipe: Recipe, seed: int, folder: Path, stage: str, batch: int, pairs: int
+) -> list[str]:
+    """The command line that trains a stage until it has seen so many pairs."""
+    epoch = len(cad_split("train"))
+    changes: dict[str, Any] = {
+        "train.devices": 1,
+        "train.schedule": "constant",
+        "train.milestones": "()",
+        "train.seed": seed,
+        "train.log_every": LOGGED // batch,
+        "train.validate_every": CADENCE // batch,
+        "train.checkpoint_every": CADENCE // batch,
+        f"{stage}.epochs": pairs / epoch,
+    }
+    fields = [f"--config.{name}={value}" for name, value in changes.items()]
+    head = [sys.executable, "train.py", f"--config={recipe.config}.py", f"--run_dir={folder}"]
+    return [*head, f"--stage={stage}", "--noevaluate", *fields]
+
+
+def spent(folder: Path) -> dict[str, Any] | None:
+    """Pairs and CPU seconds of each stage so far; None of a run that came from elsewhere."""
+    seen, seconds = _read(folder)
+    return {"pairs": seen, "cpu_seconds": seconds} if seen else None
+
+
+def _cpu_seconds(line: Sequence[str]) -> float:
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run(line)
+    if done.returncode:
+        raise SystemExit(f"error: training ended with status {done.returncode}: {' '.join(line)}")
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def _read(folder: Path) -> tuple[dict[str, int], dict[str, float]]:
+    path = folder / "spent.json"
+    if not path.exists():
+        return {}, {}
+    found = json.loads(path.read_text())
+    return found["pairs"], found["cpu_seconds"]
+
+
+def _write(folder: Path, seen: dict[str, int], seconds: dict[str, float]) -> None:
+    text = json.dumps({"pairs": seen, "cpu_seconds": seconds})
+    write_atomic(folder / "spent.json", text.encode())

@@ -1,0 +1,193 @@
+"""The paper's tables: what is trained by which command, kept, scored once, and printed."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from benchmarks.paper import of_data, public, published, tables
+from benchmarks.paper.recipes import RECIPES, configuration, run_folder, seeds, stages
+from benchmarks.paper.scoring import classical_methods, first, read_row, score_runs
+from benchmarks.paper.training import affordable, spent, train
+from dbdnet_jax.data.frozen import cad_test_pairs
+from dbdnet_jax.data.test_pairs import PairSet
+from dbdnet_jax.networks.initial import init_params
+from dbdnet_jax.networks.weights import save_params
+from tests.networks.small_peers import CONFIGS
+from tests.peers import WEIGHTS
+
+PAIRS = 1200
+
+
+def tiny_set(count: int = 2) -> PairSet:
+    pairs, digest = cad_test_pairs("noise")
+    symmetric = np.arange(len(pairs.source.count)) % 2 == 1
+    return first(PairSet("cad_test_noise", pairs, digest, symmetric=symmetric), count)
+
+
+def standing_in(seconds: float, lines: list):
+    """A stand-in for train.py: notes the command lines, takes some seconds, leaves weights."""
+
+    def run(line):
+        fields = dict(field.split("=", 1) for field in line if "=" in field)
+        lines.append(fields)
+        path = f"{fields['--run_dir']}/params.npz"
+        save_params(path, init_params(jax.random.key(0), CONFIGS["dcp"]))
+        return seconds
+
+    return run
+
+
+def stages_and_pairs(lines: list) -> list[tuple[str, int]]:
+    """Of each command line."""
+    return [
+        (fields["--stage"], round(642 * float(fields[f"--config.{fields['--stage']}.epochs"])))
+        for fields in lines
+    ]
+
+
+def test_every_recipe_has_a_configuration_and_the_ladder_has_every_step():
+    for recipe in RECIPES.values():
+        assert set(stages(configuration(recipe))) <= set(configuration(recipe).stages)
+    steps = [recipe.step for recipe in RECIPES.values() if recipe.step]
+    assert sorted(steps) == list(published.ABLATION)
+    assert [len(seeds(RECIPES[name], 3)) for name in ("dcp", "dgcnn")] == [1, 3]
+
+
+def test_two_stages_share_the_pairs_and_then_the_minutes_and_a_second_call_does_nothing(tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    lines: list = []
+    recipe, run = RECIPES["dual_branches"], standing_in(100.0, lines)
+    train(recipe, 2, folder, pairs=PAIRS, minutes=30, run=run)
+    # 600 pairs in 60 s beside the start: 785 s more are 7,850, in whole validations.
+    assert stages_and_pairs(lines) == [
+        ("overlap", 600),
+        ("registration", 600),
+        ("overlap", 600 + 7600),
+        ("registration", 600 + 7600),
+    ]
+    fields = lines[0]
+    assert fields["--config"] == "configs/ablations/dual_branches.py"
+    assert fields["--config.train.schedule"] == "constant"
+    assert (fields["--config.train.seed"], fields["--config.train.devices"]) == ("2", "1")
+    assert fields["--config.train.validate_every"] == "200"  # steps of 2
+    assert spent(folder)["cpu_seconds"] == {"overlap": 200.0, "registration": 200.0}
+    at_the_pairs = json.loads((folder / "pairs.json").read_text())
+    assert at_the_pairs["pairs"] == {"overlap": 600, "registration": 600}
+    train(recipe, 2, folder, pairs=PAIRS, minutes=30, run=pytest.fail)
+
+
+def test_a_run_that_was_stopped_between_the_points_goes_on(tmp_path):
+    lines: list = []
+    run = standing_in(100.0, lines)
+    train(RECIPES["dcp"], 0, tmp_path, pairs=PAIRS, minutes=0, run=run)
+    assert stages_and_pairs(lines) == [("dcp", PAIRS)]  # no time is left
+    (tmp_path / "minutes.npz").unlink()
+    train(RECIPES["dcp"], 0, tmp_path, pairs=PAIRS, minutes=30, run=run)
+    assert [pairs for _, pairs in stages_and_pairs(lines)] == [PAIRS, PAIRS + 33600]
+
+
+def test_a_finished_run_from_elsewhere_is_not_trained(tmp_path):
+    for name in ("pairs.npz", "minutes.npz"):
+        (tmp_path / name).touch()
+    train(RECIPES["dcp"], 0, tmp_path, pairs=PAIRS, minutes=30, run=pytest.fail)
+    assert spent(tmp_path) is None
+
+
+def test_no_pairs_are_affordable_when_the_time_is_up():
+    assert affordable(1600, 1800.0, 1800.0) == 1600
+    assert affordable(1600, 840.0, 1800.0) == 1600 + 1600
+
+
+def test_scores_are_kept_and_only_what_changed_is_scored_again(tmp_path, monkeypatch):
+    folder, results, sets = tmp_path / "dcp", tmp_path / "results", {"noise": tiny_set()}
+    folder.mkdir()
+    save_params(folder / "pairs.npz", init_params(jax.random.key(0), CONFIGS["dcp"]))
+    score_runs(["dcp", "omnet"], tmp_path, 3, sets, results)
+    assert read_row(results, "omnet") is None
+    held = read_row(results, "dcp")
+    assert held["measured"]["cpu"] and list(held["seeds"]) == ["0"]
+    found = held["seeds"]["0"]["pairs"]["sets"]["noise"]
+    assert found["set"] == "cad_test_noise_first_2" and found["all"]["pairs"] == 2
+    assert found["plain"]["pairs"] == found["symmetric"]["pairs"] == 1
+    assert "overlap" not in found
+    monkeypatch.setattr("benchmarks.paper.scoring.figures", lambda *_: {"set": "again"})
+    score_runs(["dcp"], tmp_path, 3, sets, results)
+    assert read_row(results, "dcp") == held
+    save_params(folder / "pairs.npz", init_params(jax.random.key(1), CONFIGS["dcp"]))
+    score_runs(["dcp"], tmp_path, 3, sets, results)
+    assert read_row(results, "dcp")["seeds"]["0"]["pairs"]["sets"]["noise"] == {"set": "again"}
+
+
+def summary(error: float) -> dict:
+    return {
+        "all": {
+            "rmse_euler_deg": 1.0,
+            "rmse_translation": 0.1,
+            "mae_euler_deg": 2.0,
+            "mae_translation": 0.2,
+            "error_rotation_deg": error,
+            "error_translation": 0.3,
+        }
+    }
+
+
+def test_the_tables_are_of_what_there_is_and_empty_elsewhere(tmp_path):
+    (tmp_path / "icp.json").write_text(json.dumps({"sets": {"noise": summary(38.2)}}))
+    for name, errors in (("dcp", [25.5]), ("dgcnn", [40.0, 42.0, 44.0])):
+        rows = {str(i): {"pairs": {"sets": {"noise": summary(x)}}} for i, x in enumerate(errors)}
+        (tmp_path / f"{name}.json").write_text(json.dumps({"seeds": rows}))
+    lines = tables.of_results(tmp_path).splitlines()
+    start = lines.index("### noise, the same pairs, the paper's unseen categories, noise beside")
+    part = lines[start:]
+
+    def line(begin: str) -> list[str]:
+        return next(x for x in part if x.startswith(f"| {begin} |")).strip("| ").split(" | ")
+
+    assert line("DCP")[5:7] == ["25.500", "0.300"] and line("DCP")[-2:] == ["23.184", "0.366"]
+    assert line("ICP")[5] == "38.200"
+    finet = next(x for x in part if x.startswith("| FINet |"))
+    assert finet.endswith("|  |  | 7.748 | 0.117 |")  # nothing of ours
+    assert line("1 DGCNN encoder")[1] == "42.000 +- 2.000"
+    assert line("1 DGCNN encoder")[-2:] == ["6.716", "0.181"]
+    assert tables.spread([3.0], 1) == "3.0" and tables.spread([], 1) == ""
+
+
+def test_a_data_sets_tables_are_of_the_weights_that_lie_there(tmp_path, monkeypatch):
+    monkeypatch.setattr(of_data, "_load", lambda config, runs: tiny_set())
+    identity = {"identity": classical_methods()["identity"]}
+    monkeypatch.setattr(of_data, "classical_methods", lambda: identity)
+    folder = run_folder(tmp_path, "dcp", 0)
+    folder.mkdir()
+    save_params(folder / "params.npz", init_params(jax.random.key(0), CONFIGS["dcp"]))
+    config = configuration(RECIPES["cad"])
+    text = of_data.tables(config, ["dcp", "finet", "dgcnn"], tmp_path, 1)
+    titles = [line[4:] for line in text.splitlines() if line.startswith("### ")]
+    assert titles == [*of_data.SHAPE_TABLES, "Overlap", "Ablation"]
+    rows = [line.split(" | ") for line in text.splitlines() if line.startswith("| DCP")]
+    trained = [all(cell for cell in row[1:7]) for row in rows]
+    assert trained == [True, False, True, False]  # none was trained on a half of the categories
+    assert rows[-1][-6:] == ["16.532", "0.249", "12.022", "0.181", "23.184", "0.366 |"]
+
+
+def test_public_weights_are_told_by_their_name(tmp_path):
+    with pytest.raises(ValueError, match="named after one of dbdnet, dcp, rienet.*got mine.t7"):
+        public.public_params(tmp_path / "mine.t7")
+    with pytest.raises(ValueError, match="must be a folder with .t7 files"):
+        public.tables(tmp_path, {})
+
+
+# The first 20 pairs: measured, as the whole set takes a minute each. RIENet's wrong answers hang on
+# rounding: float64 moves one in twelve by more than 5 degrees, and the mean of 20 by several.
+@pytest.mark.skipif(
+    not (WEIGHTS / "dcp_v1.t7").exists(), reason="needs ../shared/peers/weights, the authors' files"
+)
+@pytest.mark.parametrize(
+    ("name", "error", "within"), [("dcp_v1", 107.8, 1.0), ("rienet_modelnet-unseen", 126.8, 12.0)]
+)
+def test_public_weights_fail_on_our_pairs_as_was_recorded(tmp_path, name, error, within):
+    (tmp_path / f"{name}.t7").symlink_to(WEIGHTS / f"{name}.t7")
+    row = public.tables(tmp_path, {"noise": tiny_set(20)}).splitlines()[-1].split(" | ")
+    assert float(row[1]) == pytest.approx(error, abs=within)
