@@ -1,0 +1,1 @@
+"""Attacks on `align` and on the files it reads; see `__main__`."""
