@@ -118,6 +118,7 @@ def test_rows_of_processes_come_back_in_their_order(monkeypatch):
     assert from_all_processes(np.zeros(3), 7).tolist() == list(range(7))
 
 
+@pytest.mark.slow
 def test_two_processes_make_one_table():
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))

@@ -1,5 +1,7 @@
 """Products in bfloat16: rounded factors, sums and all else in float32."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,11 +10,12 @@ from jax.extend.core import jaxprs_in_params
 from ml_dtypes import bfloat16
 
 from dbdnet_jax.networks.dbdnet.register import register
+from dbdnet_jax.networks.initial import init_params
 from dbdnet_jax.networks.params import bfloat16_kernels
 from dbdnet_jax.ops.attention import attention
 from dbdnet_jax.ops.products import product
 from tests.conftest import EXACT, FLOAT32, assert_close, random_cloud
-from tests.networks.dbdnet.small import small_params
+from tests.networks.dbdnet.small import SMALL
 
 
 def rounded(x):
@@ -62,19 +65,30 @@ def products_of(jaxpr):
             yield from products_of(inner)
 
 
-def test_a_network_of_rounded_kernels_keeps_geometry_and_coordinates_in_float32():
-    params = small_params(5, dtype=np.float32)
+def network(encoder: str):
+    """A small one, the same with rounded kernels, and two clouds."""
+    config = dataclasses.replace(SMALL, encoder=encoder)
+    params = init_params(jax.random.key(5), config)
     low = params.replace(networks=bfloat16_kernels(params.networks))
-    clouds = [jnp.asarray(random_cloud(i, 40), jnp.float32) for i in (0, 1)]
+    return params, low, [jnp.asarray(random_cloud(i, 40), jnp.float32) for i in (0, 1)]
+
+
+@pytest.mark.parametrize(("encoder", "at_least"), [("multiresolution", 50), ("dgcnn", 20)])
+def test_a_network_of_rounded_kernels_keeps_geometry_and_coordinates_in_float32(encoder, at_least):
+    _, low, clouds = network(encoder)
     products = list(products_of(jax.make_jaxpr(register)(low, *clouds).jaxpr))
     half = [e for e in products if e.invars[0].aval.dtype == jnp.bfloat16]
-    assert len(half) > 50  # of these networks' layers and attentions
+    assert len(half) > at_least  # of these networks' layers and attentions
     assert all(e.outvars[0].aval.dtype == np.float32 for e in half)
     exact = [e for e in products if e.params["precision"] and e not in half]
     assert len(exact) > 10 and not any(e.params["precision"] for e in half)
     # Points, and points with the number of their cloud.
     layers = {e.invars[1].aval.shape for e in half}
     assert not any(shape[0] == 3 for shape in layers) and (4, 64) not in layers
+
+
+def test_rounded_kernels_change_answers_a_little():
+    params, low, clouds = network("dgcnn")
     found, expected = (jax.jit(register)(x, *clouds) for x in (low, params))
     assert {leaf.dtype for leaf in jax.tree.leaves(found)} <= {np.dtype("float32"), np.dtype(bool)}
     difference = np.abs(found.src_overlap - expected.src_overlap).max()

@@ -75,6 +75,7 @@ def test_devices_take_their_rows_of_a_batch(tmp_path, monkeypatch, expected, dev
     assert_close(curve(tmp_path), expected, FLOAT32)
 
 
+@pytest.mark.slow
 def test_processes_bring_their_own_rows(tmp_path, expected):
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))

@@ -42,7 +42,8 @@ class DGCNN(nn.Module):
             index = level.neighbours
             if self.neighbour_space == "feature":
                 index = knn(place, place, index.shape[1], level.count)
-            layer = EdgeConv(width * self.channels, groups, name=f"stage{stage}_conv1")
+            name = f"stage{stage}_conv1"
+            layer = EdgeConv(width * self.channels, groups, of_points=stage == 1, name=name)
             x = place = layer(x, index, level.valid)
             layers.append(x)
         ((features, groups),) = _fusion(self.channels)
