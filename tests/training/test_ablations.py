@@ -71,12 +71,9 @@ def test_a_single_network_is_trained_alone_and_a_stopped_run_ends_as_an_unbroken
     assert len(losses) == 3 and losses[-1] < losses[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "masks"),
-    [
-        ("joint_overlap", "predicted"),
-        pytest.param("prior_overlap", "truth", marks=pytest.mark.slow),
-    ],
+    ("name", "masks"), [("joint_overlap", "predicted"), ("prior_overlap", "truth")]
 )
 def test_a_few_steps_lower_the_loss(tmp_path, name, masks):
     task = STAGES["dbdnet"]["registration"].make_task(config(name, masks=masks), tmp_path)

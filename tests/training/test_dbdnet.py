@@ -30,6 +30,7 @@ def config() -> RunConfig:
     config.model.overlap_channels = config.model.registration_channels = 4
     config.model.overlap_blocks = 1
     config.model.encoder = "dgcnn"  # compiles in a fifth of the time
+    config.model.branches, config.model.shared_blocks = 1, 0
     config.model.overlap_passes = 1  # more start from another random motion in every step
     config.model.heads = 2
     config.model.neighbours = 4
