@@ -25,6 +25,7 @@ def test_kills_at_random_moments_change_nothing(tmp_path):
     assert differences(STAND_IN, tmp_path, kills=2, seed=1) == []
 
 
+@pytest.mark.slow
 def test_a_closed_terminal_saves_and_a_second_training_is_refused(tmp_path):
     command = [*STAND_IN, f"--run_dir={tmp_path / 'run'}", "--config.overlap.epochs=200"]
     command += [f"--config.train.{name}_every=2000" for name in ("validate", "checkpoint")]
