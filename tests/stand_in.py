@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from ml_collections import ConfigDict
 
 from dbdnet_jax.data.pairs import Protocol
 from dbdnet_jax.data.shapes import Shapes
@@ -37,6 +38,19 @@ class Terms(NamedTuple):
 
     fit: jax.Array
     size: jax.Array
+
+
+def six_steps(config: ConfigDict) -> None:
+    """Six steps of two pairs of 64 points in three epochs of four shapes, with rows of the log."""
+    config.protocol.points = 64
+    config.train.batch_size = 2
+    config.train.learning_rate = 3e-3
+    config.train.warmup_epochs = 0.0
+    config.train.ema_decay = 0.0
+    config.train.log_every = 2
+    config.train.checkpoint_every = 2
+    config.train.validate_every = 6
+    config.train.validation_pairs = 2
 
 
 def shapes(count: int = 8, points: int = 32, seed: int = 0) -> Shapes:

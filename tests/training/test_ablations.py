@@ -29,14 +29,7 @@ def config(name: str, model: dict = QUICK, **changes: object) -> RunConfig:
     config = LADDER[name].get_config()
     model = small_step(name, neighbours=4, dropout=0.1, **model)
     config.model.update(dataclasses.asdict(model))
-    config.protocol.points = 64
-    config.train.learning_rate = 3e-3
-    config.train.warmup_epochs = 0.0
-    config.train.ema_decay = 0.0
-    config.train.log_every = 2
-    config.train.checkpoint_every = 2
-    config.train.validate_every = 6
-    config.train.validation_pairs = 2
+    stand_in.six_steps(config)
     config.registration.epochs = 3.0
     for field, value in changes.items():
         config.registration[field] = value

@@ -37,15 +37,7 @@ def config() -> RunConfig:
     config.model.min_points = 12
     config.model.dropout = 0.1
     config.model.local_geometry = 0
-    config.protocol.points = 64
-    config.train.batch_size = 2
-    config.train.learning_rate = 3e-3
-    config.train.warmup_epochs = 0.0
-    config.train.ema_decay = 0.0
-    config.train.log_every = 2
-    config.train.checkpoint_every = 2
-    config.train.validate_every = 6
-    config.train.validation_pairs = 2
+    stand_in.six_steps(config)
     config.overlap.epochs = config.registration.epochs = config.joint.epochs = 3.0
     config.registration.masks = "predicted"
     return read_config(config)
