@@ -14,7 +14,7 @@ degrees), valid, and both valid and wrong. ``threads`` aligns one pair in so man
 ``points`` one of so many points; ``programs`` damages kept programs between alignments in new
 processes, ``pickles`` and ``checkpoints`` change, cut or lengthen files at random: each must be
 read or refused in words, within a minute. Ends with status 1 where one of these is not so, or where
-a valid answer is wrong in more than one of fifty.
+of fifty valid answers more than one is wrong that is not wrong unspoiled.
 """
 
 import argparse
