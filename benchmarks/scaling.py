@@ -6,12 +6,13 @@
     python -m benchmarks.scaling --part=training --count=200 --jobs=1,2
 
 ``pairs`` aligns noisy test pairs of CAD shapes with `align_pairs`, every tenth damaged, on one
-process and on more: seconds with the start, and from the first answer to the last, so that starting
-counts for none. ``memory`` aligns in this process and gives its resident memory at 100 alignments
-and at the end. ``dask`` aligns on two workers of Dask, of which one is killed half-way. Each fails
-if a pair has no answer, or two, or if one that is not damaged fails. ``training`` takes steps of
-the CAD configuration's overlap stage, of batches of four pairs: on one XLA device that has one
-core, and on more with a core each; its efficiency is the speed against that many times the first.
+process that has one core and on more with a core each: seconds with the start, and from the first
+answer to the last, so that starting counts for none. ``memory`` aligns in this process and gives
+its resident memory at 100 alignments and at the end. ``dask`` aligns on two workers of Dask, of
+which one is killed half-way. Each fails if a pair has no answer, or two, or if one that is not
+damaged fails. ``training`` takes steps of the CAD configuration's overlap stage, of batches of four
+pairs: on one XLA device that has one core, and on more with a core each; its efficiency is the
+speed against that many times the first.
 """
 
 import argparse
@@ -43,7 +44,7 @@ def some_pairs(count: int, damaged: bool) -> Iterator[tuple[Any, Any]]:
     sources, targets = np.asarray(pairs.source.points), np.asarray(pairs.target.points)
     for i in range(count):
         source, target = sources[i % len(sources)], targets[i % len(targets)]
-        if damaged and i % EVERY == 0:
+        if damaged and i % EVERY == EVERY - 1:  # not the first, whose answer ends the start
             nan = np.where(np.arange(source.size).reshape(source.shape) == i, np.nan, source)
             source = ("missing.ply", source[:3], nan)[i // EVERY % 3]
         yield source, target
@@ -62,7 +63,7 @@ def answer(found: Iterator[Any], count: int, damaged: bool, at_half: Callable) -
         failed += [number] if failure else []
         if len(numbers) == count // 2:
             at_half()
-    expected = list(range(0, count, EVERY)) if damaged else []
+    expected = list(range(EVERY - 1, count, EVERY)) if damaged else []
     if sorted(numbers) != list(range(count)) or sorted(failed) != expected:
         raise SystemExit(f"{len(numbers)} answers to {count} pairs; failed: {sorted(failed)}")
     sound = times[-1] - times[0]
@@ -77,8 +78,9 @@ def answer(found: Iterator[Any], count: int, damaged: bool, at_half: Callable) -
 def by_processes(count: int, jobs: list[int]) -> dict[str, Any]:
     """The same pairs on each number of processes; the speed against that of the first."""
     list(align_pairs(some_pairs(2, False), jobs=1))  # makes the programs that are kept
-    found = {}
+    cores, found = available_cores(max(jobs)), {}
     for number in jobs:
+        os.sched_setaffinity(0, cores[:number])  # which the processes inherit
         results = align_pairs(some_pairs(count, True), jobs=number)
         found[str(number)] = answer(results, count, True, lambda: None)
     first = found[str(jobs[0])]["pairs_per_s"]
@@ -123,9 +125,7 @@ def by_devices(count: int, numbers: list[int]) -> dict[str, Any]:
     Raises:
       SystemExit: there are not so many cores.
     """
-    there = len(os.sched_getaffinity(0))
-    if max(numbers) > there:
-        raise SystemExit(f"--jobs must be at most the {there} cores there are; got {numbers}.")
+    available_cores(max(numbers))
     found = {}
     for number in numbers:
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as executor:
@@ -133,6 +133,18 @@ def by_devices(count: int, numbers: list[int]) -> dict[str, Any]:
     first = found[numbers[0]]["pairs_per_s"] / numbers[0]
     efficiency = {str(x): round(y["pairs_per_s"] / x / first, 2) for x, y in found.items()}
     return {"training": {str(x): y for x, y in found.items()}, "efficiency": efficiency}
+
+
+def available_cores(needed: int) -> list[int]:
+    """The cores that this process may use.
+
+    Raises:
+      SystemExit: there are fewer than are needed.
+    """
+    cores = sorted(os.sched_getaffinity(0))
+    if needed > len(cores):
+        raise SystemExit(f"--jobs must be at most the {len(cores)} cores there are; got {needed}.")
+    return cores
 
 
 def train_on(devices: int, count: int) -> dict[str, float]:
@@ -147,8 +159,7 @@ def train_on(devices: int, count: int) -> dict[str, float]:
     from dbdnet_jax.data.training_pairs import pairs_of_shapes
     from dbdnet_jax.training.config import read_config
 
-    cores = sorted(os.sched_getaffinity(0))[:devices]
-    os.sched_setaffinity(0, cores)
+    os.sched_setaffinity(0, available_cores(devices)[:devices])
     jax.config.update("jax_num_cpu_devices", devices)
     config = cad.get_config()
     config.train.batch_size, config.train.devices = BATCH, devices

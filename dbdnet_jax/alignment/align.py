@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 
 from dbdnet_jax.alignment import finding
 from dbdnet_jax.alignment.finding import Found
-from dbdnet_jax.alignment.mirrored import mirror_doubts
+from dbdnet_jax.alignment.mirrored import trust_beside_mirror
 from dbdnet_jax.alignment.normalised import (
     NormalisedCloud,
     NormalisedPair,
@@ -21,7 +21,7 @@ from dbdnet_jax.alignment.normalised import (
 )
 from dbdnet_jax.alignment.search import NetworkPose
 from dbdnet_jax.alignment.success import Coefficients, PoseFeatures, load_coefficients
-from dbdnet_jax.alignment.validity import rejection_reason, warnings
+from dbdnet_jax.alignment.validity import Trust, rejection_reason, warnings
 from dbdnet_jax.io.forks import require_own_jax
 from dbdnet_jax.io.point_files import read_point_file
 from dbdnet_jax.io.programs import loading_seconds
@@ -125,7 +125,7 @@ def align(
       params: the network; the weights in the package, if None.
       refine: refine poses; else the best of the network's and those given is the answer.
       search: "near" for poses near the given orientation (or ``initial``), "any" for all rotations,
-        "auto" for these only where the former leave a doubt. Of poses that fit alike the one
+        "auto" for these only where the former leave a trust. Of poses that fit alike the one
         nearest to the given orientation is the answer.
       scale: factor from the clouds' unit to the weights'; "auto" brings the larger cloud to the
         size of a partial scan of a shape in the unit sphere.
@@ -159,9 +159,9 @@ def align(
         params, scene, coefficients, search, refine=refine, guess=given, proposals=others
     )
     laps["search"] = _clock()
-    reason, doubts = _judge(scene, found, coefficients, refine)
+    trust = _judge(scene, found, coefficients, refine)
     laps["quality"] = _clock()
-    return _report(scene, found, reason, (*source.notes, *target.notes, *doubts), laps, loaded)
+    return _report(scene, found, trust, (*source.notes, *target.notes), laps, loaded)
 
 
 def _with_threshold(params: Params | None, overlap_threshold: float) -> Params:
@@ -173,18 +173,17 @@ def _with_threshold(params: Params | None, overlap_threshold: float) -> Params:
     return dataclasses.replace(params, config=config)
 
 
-def _judge(
-    scene: NormalisedPair, found: Found, coefficients: Coefficients, refine: bool
-) -> tuple[str, tuple[str, ...]]:
-    """Why the pose is not to be trusted ("" if it is), and warnings; mirrored poses are refined."""
-    reason = rejection_reason(scene, found)
-    return (reason, ()) if reason or not refine else mirror_doubts(scene, found, coefficients)
+def _judge(scene: NormalisedPair, found: Found, coefficients: Coefficients, refine: bool) -> Trust:
+    """Whether the pose is to be trusted; mirrored ones, if refined, are held against it."""
+    if (reason := rejection_reason(scene, found)) or not refine:
+        return Trust(found.probability, reason, ())
+    return trust_beside_mirror(scene, found, coefficients)
 
 
 def _report(
     scene: NormalisedPair,
     found: Found,
-    reason: str,
+    trust: Trust,
     notes: tuple[str, ...],
     laps: dict[str, float],
     loaded: float,
@@ -199,10 +198,10 @@ def _report(
     unit = np.repeat([1.0, scene.factor], 3)
     return Alignment(
         transform=as_given(found.pose, scene),
-        valid=not reason,
-        reason=reason,
-        success_probability=found.probability,
-        warnings=(*notes, *warnings(scene, found)),
+        valid=not trust.reason,
+        reason=trust.reason,
+        success_probability=trust.probability,
+        warnings=(*notes, *trust.warnings, *warnings(scene, found)),
         inlier_ratio=float(quality.inlier.mean()),
         inlier_distance=quality.distance / scene.factor,
         rmse=quality.rmse / scene.factor,

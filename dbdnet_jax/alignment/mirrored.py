@@ -11,17 +11,19 @@ import numpy as np
 from dbdnet_jax.alignment import search
 from dbdnet_jax.alignment.candidates import examine, far_starts
 from dbdnet_jax.alignment.consensus import agreed_poses, agreement
-from dbdnet_jax.alignment.finding import Found, even_points
+from dbdnet_jax.alignment.finding import LIKELY, Found, even_points
 from dbdnet_jax.alignment.normalised import NormalisedPair
 from dbdnet_jax.alignment.success import Coefficients, fit_score
 from dbdnet_jax.alignment.surfaces import inlier_distance, measure_fit, surface
+from dbdnet_jax.alignment.validity import Trust
 from dbdnet_jax.ops.transforms import finer_cube_rotations, move
 
 # Logarithms of odds, added up from three measures. On 32 pairs of asymmetric chairs of boxes that
-# were aligned well it came to at most -0.4, and on 26 whose source was mirrored, to at least 0.23.
-# On 34 of `tools/scan_pairs` it came to up to 1.13: of things with a plane of symmetry that overlap
-# little, the mirrored source may cover more. So all but far more than that is a warning only.
-MIRRORED, PERHAPS = 3.0, 0.2
+# were aligned well they came to at most -0.4; on 26 whose source was mirrored, to at least 0.23. On
+# right ones of `tools/scan_pairs` they came to up to 1.2: of things with a plane of symmetry that
+# overlap little, the mirrored source may cover more. Those poses have a high probability, mirrored
+# sources rarely, so it is what the mirror's odds leave of it that decides.
+PERHAPS = 0.2  # from here on a warning
 PER_RMSE = 8.0  # for each part by which the truncated RMSE is lower
 FEW = 3  # added to both numbers of matches: of few, the ratio tells little
 KEPT = 8  # of the coarsely refined poses
@@ -29,21 +31,22 @@ KEPT = 8  # of the coarsely refined poses
 MANY, TELLING = 12, 2.0
 
 
-def mirror_doubts(
-    scene: NormalisedPair, found: Found, coefficients: Coefficients
-) -> tuple[str, tuple[str, ...]]:
-    """Why the clouds are mirrored images ("" if that is not sure), and a warning if they may be."""
-    return in_words(mirrored_evidence(scene, found, coefficients))
+def trust_beside_mirror(scene: NormalisedPair, found: Found, coefficients: Coefficients) -> Trust:
+    """What is left of the trust in a pose by what mirroring the source would better."""
+    return weigh(found.probability, mirrored_evidence(scene, found, coefficients))
 
 
-def in_words(evidence: float) -> tuple[str, tuple[str, ...]]:
-    """The reason and the warnings that a logarithm of odds gives."""
+def weigh(probability: float, evidence: float) -> Trust:
+    """The odds of a pose that is right, less those of a mirrored source where they are above 1."""
     cure = "when it is mirrored: is one cloud in a left-handed frame? Negate one coordinate of it"
-    if evidence >= MIRRORED:
-        return f"the source fits clearly better {cure}", ()
+    odds = probability * math.exp(-max(evidence, 0.0))
+    left = odds / (odds + 1 - probability)
+    if left < LIKELY:
+        return Trust(left, f"the source fits better {cure}", ())
     if evidence >= PERHAPS:
-        return "", (f"the source fits as well or better {cure}, if it has no symmetry",)
-    return "", ()
+        warning = f"the source fits as well or better {cure}, if it has no symmetry"
+        return Trust(left, "", (warning,))
+    return Trust(left, "", ())
 
 
 def mirrored_evidence(scene: NormalisedPair, found: Found, coefficients: Coefficients) -> float:

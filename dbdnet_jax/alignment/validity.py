@@ -1,6 +1,7 @@
 """Whether a pose is to be trusted, and what its user should know: in words."""
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -14,6 +15,14 @@ LOW_OVERLAP, NO_OVERLAP = 0.3, 0.1  # inlier ratios that give a warning, and no 
 UNEQUAL, INCOMPATIBLE = 2.0, 4.0  # sizes of the clouds that do the same
 LINE = 1e-3  # width of what counts as a line, per length
 AS_GOOD = 0.3  # how much the best other pose's score is lower, a logarithm of odds: they fit alike
+
+
+class Trust(NamedTuple):
+    """The probability that a pose is right, why not to trust it ("" if it is), what to know."""
+
+    probability: float
+    reason: str
+    warnings: tuple[str, ...]
 
 
 def rejection_reason(scene: NormalisedPair, found: Found) -> str:

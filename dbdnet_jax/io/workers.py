@@ -15,6 +15,8 @@ from typing import Any, NamedTuple
 
 from dbdnet_jax.errors import Failure, failure_of
 
+THREADS = ("NPROC", "OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")  # NPROC: XLA's
+
 
 class Worker(NamedTuple):
     """A pool of one process, and the process's number once it is prepared."""
@@ -162,7 +164,7 @@ def _check_prepared(prepared: Future, able: bool) -> None:
 def _start(place: int, jobs: int, work: Callable[[Any], Any], prepare: Callable[[], Any]) -> Worker:
     """A new process that is getting ready."""
     pool = ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
-    with _interrupts_held():
+    with _interrupts_held(), _one_thread():
         return Worker(pool, pool.submit(_prepare, place, jobs, work, prepare))
 
 
@@ -177,6 +179,22 @@ def _interrupts_held() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextlib.contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let a process that is started here compute in one thread: a pair gains nothing from more.
+
+    Threads of NumPy's BLAS would wait for one another on the core that they share. They are made
+    when it is imported, before any function of ours is called there. A user's own numbers stay.
+    """
+    unset = [] if _may_accelerate() else [x for x in THREADS if x not in os.environ]
+    os.environ.update(dict.fromkeys(unset, "1"))
+    try:
+        yield
+    finally:
+        for name in unset:
+            os.environ.pop(name, None)
 
 
 def _kill(pool: ProcessPoolExecutor) -> None:
@@ -197,8 +215,6 @@ def _prepare(place: int, jobs: int, work: Callable[[Any], Any], prepare: Callabl
     """In a new process: keep to one core, end with the parent, get ready."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     if not _may_accelerate():
-        # XLA's threads on the CPU: a pair gains nothing from a second one.
-        os.environ.setdefault("NPROC", "1")
         cores = available_cores()
         if jobs >= len(cores) and hasattr(os, "sched_setaffinity"):  # else others may want them
             os.sched_setaffinity(0, [cores[place % len(cores)]])

@@ -7,11 +7,10 @@ from scipy.spatial.transform import Rotation
 from dbdnet_jax.alignment.consensus import match_surfaces
 from dbdnet_jax.alignment.finding import Clues, Found, find_pose
 from dbdnet_jax.alignment.mirrored import (
-    MIRRORED,
     PERHAPS,
-    in_words,
-    mirror_doubts,
     mirrored_evidence,
+    trust_beside_mirror,
+    weigh,
 )
 from dbdnet_jax.alignment.normalised import NormalisedPair, as_normalised, normalise_pair
 from dbdnet_jax.alignment.success import load_coefficients
@@ -69,7 +68,7 @@ def test_a_right_pose_beats_the_mirrored_one():
 @pytest.mark.parametrize("seed", [0, 3, 7, 11])
 def test_the_mirrored_pose_is_found_from_every_answer(seed):
     turn = Rotation.random(random_state=seed).as_matrix()
-    assert evidence_at(drawn(solid, [1, 1, -1]), transform_of(turn, np.zeros(3))) > MIRRORED
+    assert evidence_at(drawn(solid, [1, 1, -1]), transform_of(turn, np.zeros(3))) > 3
 
 
 @pytest.mark.parametrize(("flip", "told"), [([1, 1, 1], False), ([-1, 1, 1], True)])
@@ -78,13 +77,18 @@ def test_a_small_part_tells_a_mirrored_chair(seed, flip, told):
     scene = drawn(chair, flip, seed, count=2600)
     options = {"refine": True, "guess": None, "proposals": []}
     found = find_pose(tiny_params(), scene, COEFFICIENTS, "any", **options)
-    reason, warnings = mirror_doubts(scene, found, COEFFICIENTS)
-    assert bool(reason or warnings) == told
+    trust = trust_beside_mirror(scene, found, COEFFICIENTS)
+    assert bool(trust.reason or trust.warnings) == told
 
 
-def test_what_is_sure_is_a_reason_and_what_may_be_a_warning():
-    reason, warnings = in_words(MIRRORED)
-    assert "mirrored" in reason and not warnings
-    reason, (warning,) = in_words(PERHAPS)
-    assert "mirrored" in warning and not reason
-    assert in_words(-np.inf) == ("", ())
+def test_the_odds_of_a_mirrored_source_are_taken_from_those_of_the_pose():
+    left, reason, warnings = weigh(0.8, np.log(8))
+    assert left == pytest.approx(1 / 3) and "mirrored" in reason and not warnings
+    left, reason, (warning,) = weigh(0.96, np.log(4))
+    assert left == pytest.approx(6 / 7) and "mirrored" in warning and not reason
+    assert weigh(0.9, PERHAPS / 2).warnings == ()
+
+
+def test_nothing_for_a_mirror_leaves_the_probability():
+    assert weigh(0.7, -np.inf) == (pytest.approx(0.7), "", ())
+    assert weigh(1.0, 0.0) == (1.0, "", ())

@@ -50,6 +50,10 @@ def cores(_: int) -> tuple[int, ...]:
     return tuple(sorted(os.sched_getaffinity(0)))
 
 
+def threads(_: int) -> tuple[str | None, ...]:
+    return tuple(os.environ.get(name) for name in workers.THREADS)
+
+
 def refuse() -> None:
     raise FileNotFoundError("no weights there")
 
@@ -91,6 +95,16 @@ def test_processes_of_a_whole_machine_have_a_core_each(monkeypatch):
         assert shares == {(core,) for core in mine}
     else:
         assert shares == {tuple(sorted(mine))}
+
+
+def test_processes_compute_in_one_thread_unless_the_user_says_otherwise(monkeypatch):
+    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
+    for name in workers.THREADS:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    ((_, found),) = run_in_processes(threads, [0], 1, ready)
+    assert found == ("1", "1", "3", "1")
+    assert threads(0) == (None, None, "3", None)  # here nothing has changed
 
 
 def test_items_are_taken_when_there_is_room_for_them():

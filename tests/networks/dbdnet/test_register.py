@@ -103,9 +103,9 @@ def answer(params):
     return answer
 
 
-@pytest.mark.parametrize(("size", "garbage"), [(N, 0.0), (N, np.nan), (2 * N, 1e3)])
-def test_padding_does_not_matter(params, answer, size, garbage):
-    found = register_spread(params, SOURCE, TARGET, size, garbage)
+@pytest.mark.parametrize("garbage", [0.0, np.nan, 1e3])
+def test_padding_does_not_matter(params, answer, garbage):
+    found = register_spread(params, SOURCE, TARGET, 2 * N, garbage)
     assert_same_answer(taken(found, slice(COUNT), slice(M)), answer)
 
 
