@@ -38,14 +38,20 @@ def open_results(path: Path, options: dict[str, Any]) -> Results:
       OSError: it cannot be read or written.
       MissingExtraError: a library is missing for Parquet.
     """
-    table, held_lines = None, []
+    options = json.loads(json.dumps(options))
+    table, valid = None, {}
     if path.suffix.lower() == PARQUET:
         load_pyarrow()
         table = path
-        held_lines = read_lines(path) if path.exists() else []
+        if path.exists():  # refused before there is a file beside it
+            valid = _verdicts(path, read_lines(path), options)
     path = lines_file(path)
-    options = json.loads(json.dumps(options))
-    valid = {}
+    valid |= _verdicts(path, _whole_lines(path), options)
+    return Results(path, options, valid, table)
+
+
+def _whole_lines(path: Path) -> list[bytes]:
+    """The lines of a file that can be written; it is made, or a line that was cut short dropped."""
     with path.open("ab+") as file:
         file.seek(0)
         lines = file.read().splitlines(keepends=True)
@@ -55,7 +61,15 @@ def open_results(path: Path, options: dict[str, Any]) -> Results:
                 file.truncate(sum(map(len, lines)))
             else:
                 lines.append(cut)
-    for number, line in enumerate([*held_lines, *lines], 1 - len(held_lines)):
+    return lines
+
+
+def _verdicts(
+    path: Path, lines: list[bytes], options: dict[str, Any]
+) -> dict[tuple[str, str, str], bool]:
+    """Whether the answer of each pair is valid, of those that have one."""
+    valid = {}
+    for number, line in enumerate(lines, 1):
         try:
             record = json.loads(line)
             held = record["options"]
@@ -73,7 +87,7 @@ def open_results(path: Path, options: dict[str, Any]) -> Results:
             )
         if "failure" not in record:
             valid[key] = record["valid"]
-    return Results(path, options, valid, table)
+    return valid
 
 
 def find_done(results: Results, job: Job) -> bool | None:

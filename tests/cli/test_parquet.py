@@ -46,6 +46,15 @@ def test_a_batch_goes_on_from_its_parquet_file(batch):
     assert len(parquet.read_table("answers.parquet")) == 4
 
 
+def test_answers_of_other_options_are_refused_and_nothing_is_left_beside_them(batch):
+    batch("a1", *MORE)
+    before = Path("answers.parquet").read_bytes()
+    status, _, err = batch("a1", *MORE, "--seed", "3")
+    assert status == UNUSABLE and "answers.parquet have seed 0, not 3" in err
+    assert not Path("answers.parquet.jsonl").exists()
+    assert Path("answers.parquet").read_bytes() == before
+
+
 def test_what_a_kill_leaves_is_gone_on_from(batch):
     batch("a1 a2", *MORE)
     (first, second) = read_lines(Path("answers.parquet"))
