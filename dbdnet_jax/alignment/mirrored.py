@@ -20,9 +20,10 @@ from dbdnet_jax.ops.transforms import finer_cube_rotations, move
 
 # Logarithms of odds, added up from three measures. On 32 pairs of asymmetric chairs of boxes that
 # were aligned well they came to at most -0.4; on 26 whose source was mirrored, to at least 0.23. On
-# right ones of `tools/scan_pairs` they came to up to 1.2: of things with a plane of symmetry that
-# overlap little, the mirrored source may cover more. Those poses have a high probability, mirrored
-# sources rarely, so it is what the mirror's odds leave of it that decides.
+# right ones of `tools/scan_pairs` they came to up to 1.2, and of validation shapes turned by 30
+# degrees to up to 4.9: of things with a plane of symmetry the mirrored source may happen to cover
+# more. So they have to outweigh that mirrored sources are rare, and then the odds of the pose.
+RARE = 2.0
 PERHAPS = 0.2  # from here on a warning
 PER_RMSE = 8.0  # for each part by which the truncated RMSE is lower
 FEW = 3  # added to both numbers of matches: of few, the ratio tells little
@@ -37,9 +38,9 @@ def trust_beside_mirror(scene: NormalisedPair, found: Found, coefficients: Coeff
 
 
 def weigh(probability: float, evidence: float) -> Trust:
-    """The odds of a pose that is right, less those of a mirrored source where they are above 1."""
+    """The odds of a pose that is right, less those of a mirrored source beyond what is `RARE`."""
     cure = "when it is mirrored: is one cloud in a left-handed frame? Negate one coordinate of it"
-    odds = probability * math.exp(-max(evidence, 0.0))
+    odds = probability * math.exp(-max(evidence - RARE, 0.0))
     left = odds / (odds + 1 - probability)
     if left < LIKELY:
         return Trust(left, f"the source fits better {cure}", ())

@@ -8,6 +8,7 @@ from dbdnet_jax.alignment.consensus import match_surfaces
 from dbdnet_jax.alignment.finding import Clues, Found, find_pose
 from dbdnet_jax.alignment.mirrored import (
     PERHAPS,
+    RARE,
     mirrored_evidence,
     trust_beside_mirror,
     weigh,
@@ -82,13 +83,15 @@ def test_a_small_part_tells_a_mirrored_chair(seed, flip, told):
 
 
 def test_the_odds_of_a_mirrored_source_are_taken_from_those_of_the_pose():
-    left, reason, warnings = weigh(0.8, np.log(8))
+    left, reason, warnings = weigh(0.8, RARE + np.log(8))
     assert left == pytest.approx(1 / 3) and "mirrored" in reason and not warnings
-    left, reason, (warning,) = weigh(0.96, np.log(4))
+    left, reason, (warning,) = weigh(0.96, RARE + np.log(4))
     assert left == pytest.approx(6 / 7) and "mirrored" in warning and not reason
+
+
+def test_little_for_a_mirror_leaves_the_probability():
+    left, reason, (warning,) = weigh(0.6, RARE)
+    assert left == pytest.approx(0.6) and "mirrored" in warning and not reason
     assert weigh(0.9, PERHAPS / 2).warnings == ()
-
-
-def test_nothing_for_a_mirror_leaves_the_probability():
     assert weigh(0.7, -np.inf) == (pytest.approx(0.7), "", ())
     assert weigh(1.0, 0.0) == (1.0, "", ())
