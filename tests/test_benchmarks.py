@@ -93,5 +93,5 @@ def test_a_record_says_what_it_was_measured_on_and_goes_to_a_file(tmp_path, caps
 
 
 def test_a_training_on_more_devices_than_cores_is_not_measured():
-    with pytest.raises(SystemExit, match=r"at most the \d+ cores there are; got \[1, 100000\]"):
+    with pytest.raises(SystemExit, match=r"at most the \d+ cores there are; got 100000"):
         by_devices(4, [1, 100_000])
