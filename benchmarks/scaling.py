@@ -32,6 +32,7 @@ from dbdnet_jax.alignment.align import align
 from dbdnet_jax.alignment.align_pairs import align_pairs
 from dbdnet_jax.data.frozen import cad_test_pairs
 from dbdnet_jax.io.programs import keep_compiled_programs
+from dbdnet_jax.io.workers import available_cores
 
 BATCH = 4  # pairs of a training step
 EVERY = 10  # of so many pairs one is damaged
@@ -78,7 +79,7 @@ def answer(found: Iterator[Any], count: int, damaged: bool, at_half: Callable) -
 def by_processes(count: int, jobs: list[int]) -> dict[str, Any]:
     """The same pairs on each number of processes; the speed against that of the first."""
     list(align_pairs(some_pairs(2, False), jobs=1))  # makes the programs that are kept
-    cores, found = available_cores(max(jobs)), {}
+    cores, found = enough_cores(max(jobs)), {}
     for number in jobs:
         os.sched_setaffinity(0, cores[:number])  # which the processes inherit
         results = align_pairs(some_pairs(count, True), jobs=number)
@@ -125,7 +126,7 @@ def by_devices(count: int, numbers: list[int]) -> dict[str, Any]:
     Raises:
       SystemExit: there are not so many cores.
     """
-    available_cores(max(numbers))
+    enough_cores(max(numbers))
     found = {}
     for number in numbers:
         with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as executor:
@@ -135,16 +136,16 @@ def by_devices(count: int, numbers: list[int]) -> dict[str, Any]:
     return {"training": {str(x): y for x, y in found.items()}, "efficiency": efficiency}
 
 
-def available_cores(needed: int) -> list[int]:
-    """The cores that this process may use.
+def enough_cores(needed: int) -> list[int]:
+    """Cores of this process, as many as are needed.
 
     Raises:
-      SystemExit: there are fewer than are needed.
+      SystemExit: there are fewer.
     """
-    cores = sorted(os.sched_getaffinity(0))
+    cores = available_cores()
     if needed > len(cores):
         raise SystemExit(f"--jobs must be at most the {len(cores)} cores there are; got {needed}.")
-    return cores
+    return cores[:needed]
 
 
 def train_on(devices: int, count: int) -> dict[str, float]:
@@ -159,7 +160,7 @@ def train_on(devices: int, count: int) -> dict[str, float]:
     from dbdnet_jax.data.training_pairs import pairs_of_shapes
     from dbdnet_jax.training.config import read_config
 
-    os.sched_setaffinity(0, available_cores(devices)[:devices])
+    os.sched_setaffinity(0, enough_cores(devices))
     jax.config.update("jax_num_cpu_devices", devices)
     config = cad.get_config()
     config.train.batch_size, config.train.devices = BATCH, devices

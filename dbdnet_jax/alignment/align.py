@@ -125,7 +125,7 @@ def align(
       params: the network; the weights in the package, if None.
       refine: refine poses; else the best of the network's and those given is the answer.
       search: "near" for poses near the given orientation (or ``initial``), "any" for all rotations,
-        "auto" for these only where the former leave a trust. Of poses that fit alike the one
+        "auto" for these only where the former leave a doubt. Of poses that fit alike the one
         nearest to the given orientation is the answer.
       scale: factor from the clouds' unit to the weights'; "auto" brings the larger cloud to the
         size of a partial scan of a shape in the unit sphere.

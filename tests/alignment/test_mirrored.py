@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from dbdnet_jax.alignment import mirrored
 from dbdnet_jax.alignment.consensus import match_surfaces
 from dbdnet_jax.alignment.finding import Clues, Found, find_pose
 from dbdnet_jax.alignment.mirrored import (
@@ -17,7 +18,7 @@ from dbdnet_jax.alignment.normalised import NormalisedPair, as_normalised, norma
 from dbdnet_jax.alignment.success import load_coefficients
 from dbdnet_jax.ops.transforms import transform_of
 from dbdnet_jax.types import Transform
-from tests.aligning import POINTS, solid, tiny_params
+from tests.aligning import POINTS, pair, solid, tiny_align, tiny_params
 
 COEFFICIENTS = load_coefficients()
 ABOVE, BELOW = [0.9, 0.3, 0.2], [-0.7, 0.5, -0.3]  # each drawing lacks what lies farthest there
@@ -95,3 +96,15 @@ def test_little_for_a_mirror_leaves_the_probability():
     assert weigh(0.9, PERHAPS / 2).warnings == ()
     assert weigh(0.7, -np.inf) == (pytest.approx(0.7), "", ())
     assert weigh(1.0, 0.0) == (1.0, "", ())
+
+
+@pytest.mark.parametrize("evidence", [RARE + 1.0, 100.0])
+def test_the_answer_has_what_is_left(evidence, monkeypatch):
+    source, target, true = pair()
+    plain = tiny_align(source, target, initial=true)
+    monkeypatch.setattr(mirrored, "mirrored_evidence", lambda *_: evidence)
+    found = tiny_align(source, target, initial=true)
+    expected = weigh(plain.success_probability, evidence)
+    assert plain.valid and found.success_probability == pytest.approx(expected.probability)
+    assert found.reason == expected.reason and found.valid == (evidence < 100)
+    assert set(expected.warnings) <= set(found.warnings)
