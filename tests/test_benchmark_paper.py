@@ -82,11 +82,22 @@ def test_two_stages_share_the_pairs_and_then_the_minutes_and_a_second_call_does_
 def test_a_run_that_was_stopped_between_the_points_goes_on(tmp_path):
     lines: list = []
     run = standing_in(100.0, lines)
-    train(RECIPES["dcp"], 0, tmp_path, pairs=PAIRS, minutes=0, run=run)
-    assert stages_and_pairs(lines) == [("dcp", PAIRS)]  # no time is left
-    (tmp_path / "minutes.npz").unlink()
+    train(RECIPES["dcp"], 0, tmp_path, pairs=PAIRS, minutes=30, points=["pairs"], run=run)
+    assert stages_and_pairs(lines) == [("dcp", PAIRS)]
     train(RECIPES["dcp"], 0, tmp_path, pairs=PAIRS, minutes=30, run=run)
     assert [pairs for _, pairs in stages_and_pairs(lines)] == [PAIRS, PAIRS + 33600]
+
+
+def test_the_minutes_go_on_from_the_pairs(tmp_path):
+    with pytest.raises(ValueError, match="train those first"):
+        train(RECIPES["dcp"], 0, tmp_path, pairs=PAIRS, minutes=30, points=["minutes"])
+
+
+def test_no_minutes_left_are_the_weights_of_the_pairs(tmp_path):
+    lines: list = []
+    train(RECIPES["dcp"], 0, tmp_path, pairs=PAIRS, minutes=0, run=standing_in(100.0, lines))
+    assert stages_and_pairs(lines) == [("dcp", PAIRS)]
+    assert (tmp_path / "minutes.npz").read_bytes() == (tmp_path / "pairs.npz").read_bytes()
 
 
 def test_a_finished_run_from_elsewhere_is_not_trained(tmp_path):

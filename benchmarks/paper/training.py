@@ -29,15 +29,30 @@ Run = Callable[[Sequence[str]], float]  # a command line's CPU seconds
 
 
 def train(
-    recipe: Recipe, seed: int, folder: Path, *, pairs: int, minutes: float, run: Run | None = None
+    recipe: Recipe,
+    seed: int,
+    folder: Path,
+    *,
+    pairs: int,
+    minutes: float,
+    points: Sequence[str] = POINTS,
+    run: Run | None = None,
 ) -> None:
-    """Train to both points whatever is not there yet."""
+    """Train to the points, in their order, whatever is not there yet.
+
+    Raises:
+        ValueError: minutes without the pairs that they go on from.
+    """
     config = configuration(recipe)
     names = stages(config)
     seen, seconds = _read(folder)
     for point in POINTS:
-        if (folder / f"{point}.npz").exists():
+        if point not in points or (folder / f"{point}.npz").exists():
             continue
+        if point == "minutes" and not seen:
+            raise ValueError(
+                f"the minutes go on from the pairs, and {folder} has none; train those first."
+            )
         for stage in names:
             budget = pairs // len(names)
             if point == "minutes":

@@ -42,8 +42,10 @@ SPARSE = 2000  # points: of fewer, soft matching tells more than nearest neighbo
 # On 49 validation pairs of the paper's protocol 82 % of the rotations are right so (84 % where it
 # is never left, 67 % at 0); of 33 turned by any rotation 33 % (21 % and 42 %).
 LEFT_FOR = 0.1
-# Of the last step, per inlier distance: the smaller the last ones, the nearer the pose comes.
-LAST_RADII = (1.0,) * 6 + (0.7,) * 4 + (0.4,) * 8
+# Of the last step, per inlier distance: first of the even points, then of all. Of 49 synthetic
+# scans the median error is that of all points from the first (0.046 and 0.048 degrees), in half
+# the time.
+EVEN_RADII, LAST_RADII = (0.7,) * 4, (0.4,) * 8
 NO_OTHER = 4.0  # the margin where nothing else fits, and the most it counts
 
 
@@ -212,8 +214,10 @@ def last_refined(
         pose = search.refine(candidate.pose, even_points(source), even_points(target))
         return rank([pose], source, target, coefficients)[0]
     distance = inlier_distance(source, target)
-    radii = tuple(part * distance for part in LAST_RADII)
-    pose = refine_point_to_plane(candidate.pose, source, target, radii)
+    pose = candidate.pose
+    for parts, rows in ((EVEN_RADII, source.even), (LAST_RADII, None)):
+        radii = tuple(part * distance for part in parts)
+        pose = refine_point_to_plane(pose, source, target, radii, rows)
     refined = rank([pose], source, target, coefficients)[0]
     return refined if refined.score > candidate.score - ALIKE else candidate
 

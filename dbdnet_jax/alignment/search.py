@@ -140,7 +140,7 @@ def _run_em_icp(
 def _run(name: str, function: Callable, *arguments: Any) -> Any:
     """The function's results on the host, through a program kept for arguments of these shapes."""
     with jax.enable_x64(False):  # what the weights were trained in; counts are int32
-        arguments = jax.tree.map(jnp.asarray, arguments)
+        arguments = jax.device_put(arguments)  # jnp.asarray would compile a cast for every shape
         key = name, tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(arguments))
         if key not in _PROGRAMS:
             _PROGRAMS[key] = load_or_trace(function, name, *arguments)

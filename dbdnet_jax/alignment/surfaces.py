@@ -52,10 +52,18 @@ def surface(points: Points, even: Int[np.ndarray, " e"] | None = None) -> Surfac
     tree = cKDTree(points)
     count = min(len(points), max(NORMAL_NEIGHBOURS, len(points) // 500))
     distance, near = tree.query(points, k=count)
-    offsets = points[near] - points[near].mean(axis=1, keepdims=True)
+    offsets = points[near]
+    offsets -= offsets.mean(axis=1, keepdims=True)
     normals = np.linalg.eigh(np.matmul(offsets.transpose(0, 2, 1), offsets))[1][:, :, 0]
     rows = np.arange(len(points)) if even is None else even
     return Surface(points, normals, rows, tree, float(np.median(distance[:, 1])))
+
+
+def mapped(side: Surface, points: Points, turn: Float[np.ndarray, "3 3"]) -> Surface:
+    """The surface of the same points moved by a rotation or reflection, and a shift."""
+    from scipy.spatial import cKDTree
+
+    return Surface(points, side.normals @ turn.T, side.even, cKDTree(points), side.spacing)
 
 
 def inlier_distance(source: Surface, target: Surface) -> float:

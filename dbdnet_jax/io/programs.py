@@ -2,6 +2,7 @@
 
 import functools
 import hashlib
+import json
 import threading
 import time
 import zlib
@@ -23,6 +24,7 @@ TRACED = (
     "alignment/search.py",
 )
 _FOLDER = "jax_compilation_cache_dir"
+_NOTED = "whole.json"  # the entries that were found whole
 _SPENT = threading.local()
 _ZSTANDARD = b"\x28\xb5\x2f\xfd"  # how its frames begin
 
@@ -132,12 +134,30 @@ def _drop_damaged(folder: Path) -> None:
     """Delete JAX's entries that are not whole: it would compile anew each time, and replace none.
 
     JAX deflates them, and a deflated stream ends with a checksum; entries of zstandard, where that
-    is installed, have none, and are left to JAX.
+    is installed, have none, and are left to JAX. What was found whole is noted by its size and the
+    time of its last change, and not unpacked again until one of these differs.
     """
+    noted, whole = _read_noted(folder / _NOTED), {}
     for path in folder.glob("*-cache"):
-        data = path.read_bytes()
-        if data[:4] != _ZSTANDARD and not _is_deflated(data):
-            path.unlink(missing_ok=True)
+        state = path.stat()
+        mark = [state.st_size, state.st_mtime_ns]
+        if noted.get(path.name) != mark:
+            data = path.read_bytes()
+            if data[:4] != _ZSTANDARD and not _is_deflated(data):
+                path.unlink(missing_ok=True)
+                continue
+        whole[path.name] = mark
+    if whole != noted:
+        write_atomic(folder / _NOTED, json.dumps(whole).encode())
+
+
+def _read_noted(path: Path) -> dict[str, Any]:
+    """What a note says of the entries; nothing where there is none, or it is damaged."""
+    try:
+        noted = json.loads(path.read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return noted if isinstance(noted, dict) else {}
 
 
 def _is_deflated(data: bytes) -> bool:

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dbdnet_jax.alignment.quality import shared_point_score
-from dbdnet_jax.alignment.surfaces import inlier_distance, surface
+from dbdnet_jax.alignment.surfaces import inlier_distance, mapped, surface
+from tests.aligning import solid
 
 
 def grid(step: float) -> np.ndarray:
@@ -38,3 +40,16 @@ def test_no_evidence_for_points_in_common_is_none_against_them():
     # Just within the reach of inliers: what is beside them is capped at that reach too.
     lifted = points + [0.0, 0.0, 0.94 * distance]
     assert shared_point_score(lifted, target, distance) < 0.01
+
+
+@pytest.mark.parametrize("last", [1.0, -1.0])
+def test_a_moved_or_reflected_surface_is_that_of_the_moved_points(last):
+    points = solid(500, 1)
+    turn = Rotation.from_euler("xyz", [20, -50, 70], degrees=True).as_matrix() * [1.0, 1.0, last]
+    moved = points @ turn.T + [0.3, 0.0, -2.0]
+    found, expected = mapped(surface(points, np.arange(9)), moved, turn), surface(moved)
+    cosines = np.abs((found.normals * expected.normals).sum(axis=1))
+    np.testing.assert_allclose(cosines, 1.0, atol=1e-9)
+    assert found.spacing == pytest.approx(expected.spacing)
+    np.testing.assert_array_equal(found.even, np.arange(9))
+    np.testing.assert_array_equal(found.tree.query(moved[:5])[1], np.arange(5))

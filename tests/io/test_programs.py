@@ -184,7 +184,27 @@ def test_entries_of_jax_that_are_not_whole_are_deleted(tmp_path):
     for name, data in held.items():
         (tmp_path / f"{name}-cache").write_bytes(data)
     programs._drop_damaged(tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {"whole-cache", "zstandard-cache"}
+    assert {path.name for path in tmp_path.glob("*-cache")} == {"whole-cache", "zstandard-cache"}
+
+
+def test_whole_entries_are_unpacked_once_and_again_when_they_change(tmp_path, monkeypatch):
+    first, second = (tmp_path / f"{name}-cache" for name in ("first", "second"))
+    for path in (first, second):
+        path.write_bytes(zlib.compress(b"program"))
+    looked, is_deflated = [], programs._is_deflated
+    monkeypatch.setattr(
+        programs, "_is_deflated", lambda data: looked.append(data) or is_deflated(data)
+    )
+    programs._drop_damaged(tmp_path)
+    programs._drop_damaged(tmp_path)
+    assert len(looked) == 2
+    second.write_bytes(second.read_bytes()[:-1])
+    programs._drop_damaged(tmp_path)
+    assert len(looked) == 3 and first.exists() and not second.exists()
+    for note in (b"{", b"[]", b'{"first-cache": 3}'):
+        (tmp_path / "whole.json").write_bytes(note)
+        programs._drop_damaged(tmp_path)
+    assert len(looked) == 6 and first.exists()
 
 
 @pytest.mark.parametrize("given", [None, "/dev/null/below"])
