@@ -26,15 +26,16 @@ def tiny_set(count: int = 2) -> PairSet:
     return first(PairSet("cad_test_noise", pairs, digest, symmetric=symmetric), count)
 
 
-def standing_in(seconds: float, lines: list):
+def standing_in(lines: list, *, start: float = 20.0, each: float = 0.1):
     """A stand-in for train.py: notes the command lines, takes some seconds, leaves weights."""
 
     def run(line):
-        fields = dict(field.split("=", 1) for field in line if "=" in field)
-        lines.append(fields)
-        path = f"{fields['--run_dir']}/params.npz"
+        lines.append(dict(field.split("=", 1) for field in line if "=" in field))
+        path = f"{lines[-1]['--run_dir']}/params.npz"
         save_params(path, init_params(jax.random.key(0), CONFIGS["dcp"]))
-        return seconds
+        stage, pairs = stages_and_pairs(lines)[-1]
+        before = [seen for name, seen in stages_and_pairs(lines)[:-1] if name == stage]
+        return start + each * (pairs - max(before, default=0))
 
     return run
 
@@ -59,21 +60,22 @@ def test_two_stages_share_the_pairs_and_then_the_minutes_and_a_second_call_does_
     folder = tmp_path / "run"
     folder.mkdir()
     lines: list = []
-    recipe, run = RECIPES["dual_branches"], standing_in(100.0, lines)
+    recipe, run = RECIPES["dual_branches"], standing_in(lines)
     train(recipe, 2, folder, pairs=PAIRS, minutes=30, run=run)
-    # 600 pairs in 60 s beside the start: 785 s more are 7,850, in whole validations.
+    # 900 s each: 80 are spent on 600 pairs, 140 on twice as many more, 380 on thrice all of these,
+    # and 300 on what is left, in whole validations.
     assert stages_and_pairs(lines) == [
         ("overlap", 600),
         ("registration", 600),
-        ("overlap", 600 + 7600),
-        ("registration", 600 + 7600),
+        *(("overlap", pairs) for pairs in (1800, 5400, 8200)),
+        *(("registration", pairs) for pairs in (1800, 5400, 8200)),
     ]
     fields = lines[0]
     assert fields["--config"] == "configs/ablations/dual_branches.py"
     assert fields["--config.train.schedule"] == "constant"
     assert (fields["--config.train.seed"], fields["--config.train.devices"]) == ("2", "1")
     assert fields["--config.train.validate_every"] == "200"  # steps of 2
-    assert spent(folder)["cpu_seconds"] == {"overlap": 200.0, "registration": 200.0}
+    assert spent(folder)["cpu_seconds"] == pytest.approx({"overlap": 900, "registration": 900})
     at_the_pairs = json.loads((folder / "pairs.json").read_text())
     assert at_the_pairs["pairs"] == {"overlap": 600, "registration": 600}
     train(recipe, 2, folder, pairs=PAIRS, minutes=30, run=pytest.fail)
@@ -81,11 +83,11 @@ def test_two_stages_share_the_pairs_and_then_the_minutes_and_a_second_call_does_
 
 def test_a_run_that_was_stopped_between_the_points_goes_on(tmp_path):
     lines: list = []
-    run = standing_in(100.0, lines)
+    run = standing_in(lines)
     train(RECIPES["dcp"], 0, tmp_path, pairs=PAIRS, minutes=30, points=["pairs"], run=run)
     assert stages_and_pairs(lines) == [("dcp", PAIRS)]
     train(RECIPES["dcp"], 0, tmp_path, pairs=PAIRS, minutes=30, run=run)
-    assert [pairs for _, pairs in stages_and_pairs(lines)] == [PAIRS, PAIRS + 33600]
+    assert [pairs for _, pairs in stages_and_pairs(lines)] == [1200, 3600, 10800, 17200]
 
 
 def test_the_minutes_go_on_from_the_pairs(tmp_path):
@@ -95,7 +97,7 @@ def test_the_minutes_go_on_from_the_pairs(tmp_path):
 
 def test_no_minutes_left_are_the_weights_of_the_pairs(tmp_path):
     lines: list = []
-    train(RECIPES["dcp"], 0, tmp_path, pairs=PAIRS, minutes=0, run=standing_in(100.0, lines))
+    train(RECIPES["dcp"], 0, tmp_path, pairs=PAIRS, minutes=0, run=standing_in(lines))
     assert stages_and_pairs(lines) == [("dcp", PAIRS)]
     assert (tmp_path / "minutes.npz").read_bytes() == (tmp_path / "pairs.npz").read_bytes()
 
@@ -108,8 +110,13 @@ def test_a_finished_run_from_elsewhere_is_not_trained(tmp_path):
 
 
 def test_no_pairs_are_affordable_when_the_time_is_up():
-    assert affordable(1600, 1800.0, 1800.0) == 1600
-    assert affordable(1600, 840.0, 1800.0) == 1600 + 1600
+    assert affordable(1600, 2.0, 0.0) == affordable(1600, 2.0, 215.0 - 1) == 0
+    assert affordable(1600, 2.0, 215.0) == 2000
+
+
+def test_a_stage_goes_no_further_than_its_rate_is_known():
+    assert affordable(1600, 40.0, 1800.0) == 4800
+    assert affordable(100, 40.0, 1800.0) == 500  # but one validation always
 
 
 def test_scores_are_kept_and_only_what_changed_is_scored_again(tmp_path, monkeypatch):

@@ -21,6 +21,7 @@ from dbdnet_jax.io.files import write_atomic
 
 POINTS = ("pairs", "minutes")
 CADENCE = 400  # pairs from one validation, and checkpoint, to the next
+GROWTH = 3
 LOGGED = 200  # pairs from one row of the log to the next
 STARTING_S = 40  # of a first call that are no training
 STARTING_AGAIN_S = 15  # of a later one, whose programs are compiled already
@@ -46,6 +47,14 @@ def train(
     config = configuration(recipe)
     names = stages(config)
     seen, seconds = _read(folder)
+
+    def advance(stage: str, budget: int) -> None:
+        batch = config.stages[stage].batch_size
+        line = command(recipe, seed, folder, stage, batch, budget)
+        seconds[stage] = seconds.get(stage, 0.0) + (run or _cpu_seconds)(line)
+        seen[stage] = budget
+        _write(folder, seen, seconds)
+
     for point in POINTS:
         if point not in points or (folder / f"{point}.npz").exists():
             continue
@@ -54,27 +63,28 @@ def train(
                 f"the minutes go on from the pairs, and {folder} has none; train those first."
             )
         for stage in names:
-            budget = pairs // len(names)
+            if point == "pairs" and seen.get(stage, 0) < pairs // len(names):
+                advance(stage, pairs // len(names))
             if point == "minutes":
-                budget = affordable(
-                    seen.get(stage, budget), seconds.get(stage, 0.0), 60 * minutes / len(names)
-                )
-            if budget <= seen.get(stage, 0):
-                continue
-            batch = config.stages[stage].batch_size
-            line = command(recipe, seed, folder, stage, batch, budget)
-            seconds[stage] = seconds.get(stage, 0.0) + (run or _cpu_seconds)(line)
-            seen[stage] = budget
-            _write(folder, seen, seconds)
+                rate = seen[stage] / max(seconds[stage] - STARTING_S, 1)
+                limit = 60 * minutes / len(names)
+                while budget := affordable(seen[stage], rate, limit - seconds[stage]):
+                    before = seen[stage], seconds[stage]
+                    advance(stage, budget)
+                    took = seconds[stage] - before[1] - STARTING_AGAIN_S
+                    rate = (seen[stage] - before[0]) / max(took, 1)
         shutil.copyfile(folder / "params.npz", folder / f"{point}.npz")
         write_atomic(folder / f"{point}.json", json.dumps(spent(folder)).encode())
 
 
-def affordable(pairs: int, seconds: float, budget_s: float) -> int:
-    """How many pairs a stage can have seen at the end of its time, by its rate so far."""
-    rate = pairs / max(seconds - STARTING_S, 1)
-    left = budget_s - seconds - STARTING_AGAIN_S
-    return pairs + max(0, int(rate * left / CADENCE) * CADENCE)
+def affordable(pairs: int, rate: float, left_s: float) -> int:
+    """How many pairs a stage can have seen when its time is up; 0 if no more than it has.
+
+    At most `GROWTH` times as many as now: its rate is known of those it has seen.
+    """
+    more = min(rate * (left_s - STARTING_AGAIN_S), max((GROWTH - 1) * pairs, CADENCE))
+    whole = int(more / CADENCE) * CADENCE
+    return pairs + whole if whole > 0 else 0
 
 
 def command(

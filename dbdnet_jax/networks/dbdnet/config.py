@@ -20,7 +20,7 @@ _BOUNDS: dict[str, tuple[float, float]] = {
     "head_width": (128, 8192),
     "parameter_width": (128, 8192),
     "neighbours": (1, 1024),  # every point keeps an array of so many
-    "overlap_passes": (1, 64),  # each is traced and compiled on its own
+    "overlap_passes": (1, 64),  # each takes as long as the first
     "overlap_points": (0, 2**20),  # the matches of so many are a matrix of 4 terabytes
     "registration_points": (0, 2**20),
     "local_geometry": (0, len(RADII)),
