@@ -7,7 +7,6 @@ Weights to share are another matter: see `dbdnet_jax.networks.weights`.
 from __future__ import annotations
 
 import contextlib
-import gc
 import json
 import logging
 import warnings
@@ -169,16 +168,14 @@ class Checkpoints:
     def _read(self, step: int, like: Any) -> tuple[Any, str]:
         """The state of ``step``, and what is wrong with it ("": nothing)."""
         with _logs_silenced():
-            state, damage = self._attempt(step, like)
-            if damage:
-                gc.collect()  # asyncio's tasks that failed say so when they are collected
-        return state, damage
+            return self._attempt(step, like)
 
     def _attempt(self, step: int, like: Any) -> tuple[Any, str]:
         try:
             written = self._orbax.metadata(step).custom_metadata["crc32"]
             state = self._orbax.load(step, like)
         except Exception as error:  # which kind depends on which file is damaged
+            _LATE.leave_out(self._path(step))
             if failure := machine_error(error, self._path(step)):
                 raise failure from error
             return None, first_line(error)
@@ -200,6 +197,27 @@ class Checkpoints:
             except (ValueError, KeyError, TypeError) as error:
                 found[checkpoint] = f"its metrics: {first_line(error)}"
         return found
+
+
+class _Late(logging.Filter):
+    """Leaves out what asyncio says of failed tasks when they are collected: it was said before."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._folders: set[str] = set()
+
+    def leave_out(self, folder: Path) -> None:
+        """Tasks that failed on what lies in a folder."""
+        self._folders.add(f"{folder}/")
+        logging.getLogger("asyncio").addFilter(self)  # once, however often it is added
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether a record is of something else."""
+        message = record.getMessage()
+        return not any(folder in message for folder in self._folders)
+
+
+_LATE = _Late()
 
 
 @contextlib.contextmanager

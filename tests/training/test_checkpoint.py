@@ -2,6 +2,7 @@
 
 import errno
 import gc
+import logging
 
 import jax
 import jax.numpy as jnp
@@ -102,8 +103,19 @@ def test_a_damaged_checkpoint_names_the_folder_to_delete(tmp_path, caplog, damag
         ):
             checkpoints.restore(2, state(0))
         assert_same(checkpoints.restore(1, state(0)), state(1))
-    gc.collect()
+    gc.collect()  # of failed tasks asyncio says so when they are collected
     assert not caplog.records  # libraries log pages
+
+
+def test_tasks_that_are_collected_later_say_nothing_of_a_damage_that_was_said(tmp_path, caplog):
+    with Checkpoints(tmp_path) as checkpoints:
+        checkpoints.save(1, state(1))
+        (folder := tmp_path / "checkpoints" / "1").joinpath("state", "manifest.ocdbt").unlink()
+        with pytest.raises(CheckpointError):
+            checkpoints.restore(1, state(0))
+    for place in (folder, folder.with_name("10")):
+        logging.getLogger("asyncio").error("Task exception was never retrieved: %s/state", place)
+    assert [f"{folder}0/state" in record.getMessage() for record in caplog.records] == [True]
 
 
 def test_a_damaged_newest_checkpoint_is_set_aside(tmp_path):
