@@ -91,8 +91,13 @@ def test_a_run_that_was_stopped_between_the_points_goes_on(tmp_path):
 
 
 def test_the_minutes_go_on_from_the_pairs(tmp_path):
+    both, options = RECIPES["dual_branches"], {"minutes": 30, "points": ["minutes"]}
     with pytest.raises(ValueError, match="train those first"):
-        train(RECIPES["dcp"], 0, tmp_path, pairs=PAIRS, minutes=30, points=["minutes"])
+        train(both, 0, tmp_path, pairs=PAIRS, **options)
+    half = {"pairs": {"overlap": 600}, "cpu_seconds": {"overlap": 80.0}}
+    (tmp_path / "spent.json").write_text(json.dumps(half))  # stopped between the stages
+    with pytest.raises(ValueError, match="train those first"):
+        train(both, 0, tmp_path, pairs=PAIRS, **options)
 
 
 def test_no_minutes_left_are_the_weights_of_the_pairs(tmp_path):

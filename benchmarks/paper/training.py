@@ -21,7 +21,7 @@ from dbdnet_jax.io.files import write_atomic
 
 POINTS = ("pairs", "minutes")
 CADENCE = 400  # pairs from one validation, and checkpoint, to the next
-GROWTH = 3
+GROWTH = 3  # of the pairs, at most, from one call that measures the rate to the next
 LOGGED = 200  # pairs from one row of the log to the next
 STARTING_S = 40  # of a first call that are no training
 STARTING_AGAIN_S = 15  # of a later one, whose programs are compiled already
@@ -58,7 +58,7 @@ def train(
     for point in POINTS:
         if point not in points or (folder / f"{point}.npz").exists():
             continue
-        if point == "minutes" and not seen:
+        if point == "minutes" and not set(names) <= seen.keys():
             raise ValueError(
                 f"the minutes go on from the pairs, and {folder} has none; train those first."
             )

@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from dbdnet_jax.alignment import mirrored
+from dbdnet_jax.alignment.candidates import Candidate
 from dbdnet_jax.alignment.consensus import match_surfaces
 from dbdnet_jax.alignment.finding import Clues, Found, find_pose
 from dbdnet_jax.alignment.mirrored import (
@@ -16,11 +17,13 @@ from dbdnet_jax.alignment.mirrored import (
 )
 from dbdnet_jax.alignment.normalised import NormalisedPair, as_normalised, normalise_pair
 from dbdnet_jax.alignment.success import load_coefficients
+from dbdnet_jax.alignment.surfaces import PoseFit, surface
 from dbdnet_jax.ops.transforms import transform_of
 from dbdnet_jax.types import Transform
 from tests.aligning import POINTS, pair, solid, tiny_align, tiny_params
 
 COEFFICIENTS = load_coefficients()
+NO_FIT = PoseFit(0.0, 0.0, 0.0, 0.0, 0.5, 1.0)
 ABOVE, BELOW = [0.9, 0.3, 0.2], [-0.7, 0.5, -0.3]  # each drawing lacks what lies farthest there
 # Of a chair: middle and size of its boxes; a block on the seat is all that a mirror shows.
 BOXES = [
@@ -65,6 +68,20 @@ def evidence_at(scene: NormalisedPair, pose: Transform) -> float:
 def test_a_right_pose_beats_the_mirrored_one():
     scene = drawn(solid, [1, 1, 1])
     assert evidence_at(scene, as_normalised(np.eye(4), scene)) < 0
+
+
+def test_the_mirrored_source_has_the_normals_of_its_points(monkeypatch):
+    seen = []
+
+    def keep_source(starts, source, target, *_, **__):
+        seen.append(source)
+        return [Candidate(starts[0], NO_FIT, 0.0)]
+
+    monkeypatch.setattr(mirrored, "examine", keep_source)
+    turn = Rotation.random(random_state=3).as_matrix()
+    evidence_at(drawn(solid, [1, 1, 1]), transform_of(turn, np.zeros(3)))
+    cosines = (seen[0].normals * surface(seen[0].points).normals).sum(axis=1)
+    np.testing.assert_allclose(np.abs(cosines), 1.0, atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", [0, 3, 7, 11])
