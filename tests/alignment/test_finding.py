@@ -59,3 +59,16 @@ def test_the_last_step_is_taken_unless_it_fits_worse(monkeypatch, worse, taken):
     candidate = rank([start], source, target, COEFFICIENTS)[0]._replace(score=own + worse)
     pose = last_refined(candidate, source, target, COEFFICIENTS).pose
     assert (pose == (refined if taken else start)).all()
+
+
+def test_the_last_step_ends_on_all_points(monkeypatch):
+    source = target = surface(solid(3000, 3), np.arange(300))
+    used = []
+
+    def keep(pose, source, target, radii, rows):
+        used.append(len(source.points if rows is None else rows))
+        return pose
+
+    monkeypatch.setattr(finding, "refine_point_to_plane", keep)
+    last_refined(rank([np.eye(4)], source, target, COEFFICIENTS)[0], source, target, COEFFICIENTS)
+    assert used == [300, 3000]
