@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from benchmarks.paper import of_data, public, published, tables
-from benchmarks.paper.recipes import RECIPES, configuration, run_folder, seeds, stages
-from benchmarks.paper.scoring import classical_methods, first, read_row, score_runs
+from benchmarks.paper.recipes import RECIPES, Training, configuration, stages, trainings
+from benchmarks.paper.scoring import classical_methods, first, read_row, score_classical, score_runs
 from benchmarks.paper.training import affordable, spent, train
 from dbdnet_jax.data.frozen import cad_test_pairs
 from dbdnet_jax.data.test_pairs import PairSet
@@ -53,7 +53,8 @@ def test_every_recipe_has_a_configuration_and_the_ladder_has_every_step():
         assert set(stages(configuration(recipe))) <= set(configuration(recipe).stages)
     steps = [recipe.step for recipe in RECIPES.values() if recipe.step]
     assert sorted(steps) == list(published.ABLATION)
-    assert [len(seeds(RECIPES[name], 3)) for name in ("dcp", "dgcnn")] == [1, 3]
+    assert [len(trainings(RECIPES[name], 3, False)) for name in ("dcp", "dgcnn")] == [1, 3]
+    assert [len(trainings(RECIPES[name], 3, True)) for name in ("dcp", "dgcnn")] == [1, 0]
 
 
 def test_two_stages_share_the_pairs_and_then_the_minutes_and_a_second_call_does_nothing(tmp_path):
@@ -61,7 +62,7 @@ def test_two_stages_share_the_pairs_and_then_the_minutes_and_a_second_call_does_
     folder.mkdir()
     lines: list = []
     recipe, run = RECIPES["dual_branches"], standing_in(lines)
-    train(recipe, 2, folder, pairs=PAIRS, minutes=30, run=run)
+    train(recipe, Training(2), folder, pairs=PAIRS, minutes=30, run=run)
     # 900 s each: 80 are spent on 600 pairs, 140 on twice as many more, 380 on thrice all of these,
     # and 300 on what is left, in whole validations.
     assert stages_and_pairs(lines) == [
@@ -78,31 +79,50 @@ def test_two_stages_share_the_pairs_and_then_the_minutes_and_a_second_call_does_
     assert spent(folder)["cpu_seconds"] == pytest.approx({"overlap": 900, "registration": 900})
     at_the_pairs = json.loads((folder / "pairs.json").read_text())
     assert at_the_pairs["pairs"] == {"overlap": 600, "registration": 600}
-    train(recipe, 2, folder, pairs=PAIRS, minutes=30, run=pytest.fail)
+    train(recipe, Training(2), folder, pairs=PAIRS, minutes=30, run=pytest.fail)
+
+
+def test_a_half_of_the_categories_is_trained_for_as_many_pairs_in_a_folder_of_its_own(tmp_path):
+    lines: list = []
+    half = Training(half=True)
+    folder = half.folder(tmp_path, "dcp")
+    assert folder == of_data.weights_of("dcp", tmp_path, True).parent
+    folder.mkdir()
+    train(
+        RECIPES["dcp"],
+        half,
+        folder,
+        pairs=400,
+        minutes=30,
+        points=["pairs"],
+        run=standing_in(lines),
+    )
+    assert lines[0]["--config.data.categories"] == "seen"
+    assert float(lines[0]["--config.dcp.epochs"]) == pytest.approx(400 / 313)  # shapes of that half
 
 
 def test_a_run_that_was_stopped_between_the_points_goes_on(tmp_path):
     lines: list = []
     run = standing_in(lines)
-    train(RECIPES["dcp"], 0, tmp_path, pairs=PAIRS, minutes=30, points=["pairs"], run=run)
+    train(RECIPES["dcp"], Training(), tmp_path, pairs=PAIRS, minutes=30, points=["pairs"], run=run)
     assert stages_and_pairs(lines) == [("dcp", PAIRS)]
-    train(RECIPES["dcp"], 0, tmp_path, pairs=PAIRS, minutes=30, run=run)
+    train(RECIPES["dcp"], Training(), tmp_path, pairs=PAIRS, minutes=30, run=run)
     assert [pairs for _, pairs in stages_and_pairs(lines)] == [1200, 3600, 10800, 17200]
 
 
 def test_the_minutes_go_on_from_the_pairs(tmp_path):
     both, options = RECIPES["dual_branches"], {"minutes": 30, "points": ["minutes"]}
     with pytest.raises(ValueError, match="train those first"):
-        train(both, 0, tmp_path, pairs=PAIRS, **options)
+        train(both, Training(), tmp_path, pairs=PAIRS, **options)
     half = {"pairs": {"overlap": 600}, "cpu_seconds": {"overlap": 80.0}}
     (tmp_path / "spent.json").write_text(json.dumps(half))  # stopped between the stages
     with pytest.raises(ValueError, match="train those first"):
-        train(both, 0, tmp_path, pairs=PAIRS, **options)
+        train(both, Training(), tmp_path, pairs=PAIRS, **options)
 
 
 def test_no_minutes_left_are_the_weights_of_the_pairs(tmp_path):
     lines: list = []
-    train(RECIPES["dcp"], 0, tmp_path, pairs=PAIRS, minutes=0, run=standing_in(lines))
+    train(RECIPES["dcp"], Training(), tmp_path, pairs=PAIRS, minutes=0, run=standing_in(lines))
     assert stages_and_pairs(lines) == [("dcp", PAIRS)]
     assert (tmp_path / "minutes.npz").read_bytes() == (tmp_path / "pairs.npz").read_bytes()
 
@@ -110,7 +130,7 @@ def test_no_minutes_left_are_the_weights_of_the_pairs(tmp_path):
 def test_a_finished_run_from_elsewhere_is_not_trained(tmp_path):
     for name in ("pairs.npz", "minutes.npz"):
         (tmp_path / name).touch()
-    train(RECIPES["dcp"], 0, tmp_path, pairs=PAIRS, minutes=30, run=pytest.fail)
+    train(RECIPES["dcp"], Training(), tmp_path, pairs=PAIRS, minutes=30, run=pytest.fail)
     assert spent(tmp_path) is None
 
 
@@ -142,6 +162,33 @@ def test_scores_are_kept_and_only_what_changed_is_scored_again(tmp_path, monkeyp
     save_params(folder / "pairs.npz", init_params(jax.random.key(1), CONFIGS["dcp"]))
     score_runs(["dcp"], tmp_path, 3, sets, results)
     assert read_row(results, "dcp")["seeds"]["0"]["pairs"]["sets"]["noise"] == {"set": "again"}
+
+
+def test_the_unseen_pairs_are_for_the_weights_of_the_other_half_and_no_others(tmp_path):
+    for training, key in ((Training(), 0), (Training(half=True), 1)):
+        folder = training.folder(tmp_path, "dcp")
+        folder.mkdir()
+        save_params(folder / "pairs.npz", init_params(jax.random.key(key), CONFIGS["dcp"]))
+    sets = {"noise": tiny_set(), "unseen": tiny_set()}
+    score_runs(["dcp"], tmp_path, 1, sets, tmp_path / "results")
+    found = read_row(tmp_path / "results", "dcp")["seeds"]
+    assert {name: [*row["pairs"]["sets"]] for name, row in found.items()} == {
+        "0": ["noise"],
+        "seen": ["unseen"],
+    }
+    of = tables.learned_figures(tmp_path / "results", "dcp", "pairs", "unseen")
+    assert of == found["seen"]["pairs"]["sets"]["unseen"]
+
+
+def test_methods_without_weights_are_scored_on_the_sets_that_lack(tmp_path, monkeypatch):
+    identity = {"identity": classical_methods()["identity"]}
+    monkeypatch.setattr("benchmarks.paper.scoring.classical_methods", lambda: identity)
+    score_classical({"noise": tiny_set()}, tmp_path)
+    first_set = read_row(tmp_path, "identity")["sets"]["noise"]
+    monkeypatch.setattr("benchmarks.paper.scoring.figures", lambda *_: {"set": "scored"})
+    score_classical({"noise": tiny_set(), "unseen": tiny_set()}, tmp_path)
+    sets = read_row(tmp_path, "identity")["sets"]
+    assert sets == {"noise": first_set, "unseen": {"set": "scored"}}
 
 
 def summary(error: float) -> dict:
@@ -182,7 +229,7 @@ def test_a_data_sets_tables_are_of_the_weights_that_lie_there(tmp_path, monkeypa
     monkeypatch.setattr(of_data, "_load", lambda config, runs: tiny_set())
     identity = {"identity": classical_methods()["identity"]}
     monkeypatch.setattr(of_data, "classical_methods", lambda: identity)
-    folder = run_folder(tmp_path, "dcp", 0)
+    folder = Training().folder(tmp_path, "dcp")
     folder.mkdir()
     save_params(folder / "params.npz", init_params(jax.random.key(0), CONFIGS["dcp"]))
     config = configuration(RECIPES["cad"])

@@ -3,6 +3,7 @@
     python -m benchmarks.paper                              # all methods on the embedded shapes
     python -m benchmarks.paper --methods=dcp,dgcnn --seeds=1 --runs=runs/paper
     python -m benchmarks.paper --points=pairs               # the minutes another time
+    python -m benchmarks.paper --categories=seen            # for the pairs of unseen categories
     python -m benchmarks.paper --noscore                    # train only; --notrain: score only
     python -m benchmarks.paper --config=configs/modelnet.py --config.data.folder=PATH
     python -m benchmarks.paper --public=FOLDER              # .t7 files of DCP and RIENet
@@ -25,7 +26,7 @@ from absl import app, flags, logging
 from ml_collections import config_flags
 
 from benchmarks.paper import of_data, public, tables
-from benchmarks.paper.recipes import RECIPES, run_folder, seeds
+from benchmarks.paper.recipes import RECIPES, trainings
 from benchmarks.paper.scoring import RESULTS, SETS, first, frozen_set, score_classical, score_runs
 from benchmarks.paper.training import POINTS, train
 from dbdnet_jax.io.programs import keep_compiled_programs
@@ -36,6 +37,10 @@ METHODS = flags.DEFINE_list("methods", list(RECIPES), "Which learned methods.")
 PAIRS = flags.DEFINE_integer("pairs", 1600, "Pairs that each method is trained on.", lower_bound=1)
 MINUTES = flags.DEFINE_float("minutes", 30.0, "Minutes of one core for each method.", lower_bound=0)
 TRAINED = flags.DEFINE_multi_enum("points", POINTS, POINTS, "Train for the pairs, or the minutes.")
+HALVES = ("all", "seen")
+CATEGORIES = flags.DEFINE_multi_enum(
+    "categories", HALVES, HALVES, "Train on all categories, or on the half that is seen."
+)
 SEEDS = flags.DEFINE_integer("seeds", 3, "Seeds of each step of the ladder.", lower_bound=1)
 RUNS = flags.DEFINE_string("runs", "runs/paper", "Where the runs lie.")
 TRAIN = flags.DEFINE_bool("train", True, "Train what is not trained yet.")
@@ -66,16 +71,17 @@ def main(argv: list[str]) -> None:
             print(public.tables(Path(PUBLIC.value), {key: sets[key] for key in public.SETS}))
             return
         for name in METHODS.value:
-            for seed in seeds(RECIPES[name], SEEDS.value) if TRAIN.value else ():
-                folder = run_folder(runs, name, seed)
-                train(
-                    RECIPES[name],
-                    seed,
-                    folder,
-                    pairs=PAIRS.value,
-                    minutes=MINUTES.value,
-                    points=TRAINED.value,
-                )
+            recipe, halves = RECIPES[name], CATEGORIES.value if TRAIN.value else ()
+            for half in halves:
+                for training in trainings(recipe, SEEDS.value, half == "seen"):
+                    train(
+                        recipe,
+                        training,
+                        training.folder(runs, name),
+                        pairs=PAIRS.value,
+                        minutes=MINUTES.value,
+                        points=TRAINED.value,
+                    )
             if SCORE.value:
                 score_runs([name], runs, SEEDS.value, sets, Path(RESULTS_DIR.value))
         if SCORE.value:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.paper import published
-from benchmarks.paper.recipes import RECIPES, Recipe
+from benchmarks.paper.recipes import RECIPES, Recipe, Training
 from benchmarks.paper.scoring import classical_methods, figures, first, of_params
 from benchmarks.paper.tables import Line, ablation, overlaps, poses
 from dbdnet_jax.data.test_pairs import PairSet, load_test_pairs
@@ -54,7 +54,7 @@ def tables(config: RunConfig, names: Iterable[str], runs: Path, count: int | Non
 
 def weights_of(name: str, runs: Path, half: bool) -> Path:
     """Where a method's weights lie: those of a half of the categories apart."""
-    return runs / (f"{name}_seen" if half else name) / "params.npz"
+    return Training(half=half).folder(runs, name) / "params.npz"
 
 
 def _under(config: RunConfig, noise: bool, half: bool) -> RunConfig:

@@ -50,11 +50,24 @@ def stages(config: RunConfig) -> tuple[str, ...]:
     return parts_of(config.model)
 
 
-def seeds(recipe: Recipe, count: int) -> range:
-    """The ladder's steps are trained from several seeds, all others from one."""
-    return range(count if recipe.step else 1)
+class Training(NamedTuple):
+    """One run of a method: its seed, and whether it sees a half of the categories only."""
+
+    seed: int = 0
+    half: bool = False
+
+    def folder(self, runs: Path, name: str) -> Path:
+        """Where the method's run lies."""
+        seed = f"_seed{self.seed}" if self.seed else ""
+        return runs / f"{name}{seed}{'_seen' if self.half else ''}"
 
 
-def run_folder(runs: Path, name: str, seed: int) -> Path:
-    """Where a method's run of one seed lies."""
-    return runs / (f"{name}_seed{seed}" if seed else name)
+def trainings(recipe: Recipe, seeds: int, half: bool) -> list[Training]:
+    """The runs of a method.
+
+    On all categories the ladder's steps have several seeds and all others one; on a half of them
+    the methods that have a row have one.
+    """
+    if half:
+        return [Training(half=True)] if recipe.title else []
+    return [Training(seed) for seed in range(seeds if recipe.step else 1)]

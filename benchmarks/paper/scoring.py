@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.machine import record
 from benchmarks.paper.classical import gicp, kiss_matcher
-from benchmarks.paper.recipes import RECIPES, run_folder, seeds
+from benchmarks.paper.recipes import RECIPES, Training, trainings
 from benchmarks.paper.training import POINTS
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.frozen import CAD_VARIANTS, cad_test_pairs
@@ -24,9 +24,14 @@ from dbdnet_jax.metrics.pose import summarise
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import load_params
 
-SETS = ("noise", "clean", "disjoint")
+SETS = ("noise", "clean", "disjoint", "unseen")
 RESULTS = Path(__file__).parents[1] / "results" / "paper_cad"
 Figures = dict[str, Any]
+
+
+def of_half(key: str) -> bool:
+    """Whether a set's networks see a half of the categories only: its pairs are of the other."""
+    return CAD_VARIANTS[key][1] is not None
 
 
 def frozen_set(variant: str) -> PairSet:
@@ -102,45 +107,66 @@ def score_runs(
         recipe = RECIPES[name]
         held = read_row(results, name) or {"method": recipe.title or recipe.step, "seeds": {}}
         changed = False
-        for seed in seeds(recipe, seed_count):
-            folder = run_folder(runs, name, seed)
-            for point in POINTS:
-                path = folder / f"{point}.npz"
-                if not path.exists():
-                    continue
-                digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
-                points = held["seeds"].setdefault(str(seed), {})
-                if _complete(points.get(point, {}), digest, sets):
-                    continue
-                spent = folder / f"{point}.json"
-                method = of_params(name, load_params(path))
-                points[point] = {
-                    "weights": digest,
-                    "spent": json.loads(spent.read_text()) if spent.exists() else None,
-                    "sets": {key: figures(method, test) for key, test in sets.items()},
+        for half in (False, True):
+            tests = {key: test for key, test in sets.items() if of_half(key) == half}
+            for training in trainings(recipe, seed_count, half):
+                folder = training.folder(runs, name)
+                known = points_of(held, training)
+                new = {
+                    point: found
+                    for point in POINTS
+                    if (found := _scored(name, folder, point, tests, known)) is not None
                 }
-                changed = True
+                if new:
+                    changed = True
+                    held["seeds"][_named(training)] = known | new
         if changed:
             write_row(results, name, held)
 
 
 def score_classical(sets: Mapping[str, PairSet], results: Path = RESULTS) -> None:
-    """Score the methods without weights that have no file yet."""
+    """Score the methods without weights on the sets that their files do not hold yet."""
     for name, method in classical_methods().items():
-        held = read_row(results, name)
-        if held is None or not _complete(held, None, sets):
-            found = {key: figures(method, test) for key, test in sets.items()}
-            if not any("note" in figure for figure in found.values()):
-                write_row(results, name, {"method": method.name, "sets": found})
+        held = read_row(results, name) or {"method": method.name, "sets": {}}
+        missing = {key: test for key, test in sets.items() if not _holds(held, key, test)}
+        found = {key: figures(method, test) for key, test in missing.items()}
+        if found and not any("note" in figure for figure in found.values()):
+            write_row(results, name, held | {"sets": held["sets"] | found})
 
 
-def _complete(held: Figures, digest: str | None, sets: Mapping[str, PairSet]) -> bool:
-    scored = held.get("sets", {})
-    return held.get("weights") == digest and all(
-        (scored.get(key, {}).get("set"), scored.get(key, {}).get("sha256"))
-        == (test.name, test.digest)
-        for key, test in sets.items()
-    )
+def points_of(held: Figures, training: Training) -> Figures:
+    """What a method's file holds of one of its trainings, by the point where it was stopped."""
+    found: Figures = held["seeds"].get(_named(training), {})
+    return found
+
+
+def _named(training: Training) -> str:
+    return "seen" if training.half else str(training.seed)
+
+
+def _scored(
+    name: str, folder: Path, point: str, sets: Mapping[str, PairSet], known: Figures
+) -> Figures | None:
+    """A point's weights on the sets; None of weights that are not there, or known already."""
+    path, spent = folder / f"{point}.npz", folder / f"{point}.json"
+    if not sets or not path.exists():
+        return None
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()[:12]
+    held = known.get(point, {})
+    if held.get("weights") == digest and all(_holds(held, *item) for item in sets.items()):
+        return None
+    method = of_params(name, load_params(path))
+    return {
+        "weights": digest,
+        "spent": json.loads(spent.read_text()) if spent.exists() else None,
+        "sets": {key: figures(method, test) for key, test in sets.items()},
+    }
+
+
+def _holds(held: Figures, key: str, test: PairSet) -> bool:
+    """Whether a method's figures on this very set are there."""
+    scored = held.get("sets", {}).get(key, {})
+    return (scored.get("set"), scored.get("sha256")) == (test.name, test.digest)
 
 
 def read_row(results: Path, name: str) -> Figures | None:

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.paper import published
-from benchmarks.paper.recipes import RECIPES
-from benchmarks.paper.scoring import SETS, classical_methods, read_row
+from benchmarks.paper.recipes import RECIPES, Training
+from benchmarks.paper.scoring import SETS, classical_methods, of_half, points_of, read_row
 from benchmarks.paper.training import POINTS
 
 POSE = {  # the paper's columns, and their digits
@@ -111,7 +111,7 @@ def of_results(results: Path) -> str:
         for key in SETS:
             lines = [_classical(results, name, key) for name in classical_methods()]
             lines += [
-                (recipe.title, learned_figures(results, name, 0, point, key))
+                (recipe.title, learned_figures(results, name, point, key))
                 for name, recipe in methods.items()
                 if not recipe.overlap_only
             ]
@@ -122,7 +122,7 @@ def of_results(results: Path) -> str:
                 poses_by_symmetry(lines, published.POSES.get(paper, {})),
             ]
         lines = [
-            (recipe.title, learned_figures(results, name, 0, point, "noise"))
+            (recipe.title, learned_figures(results, name, point, "noise"))
             for name, recipe in methods.items()
             if recipe.title in published.OVERLAP or recipe.title in _ALSO_OVERLAP
         ]
@@ -138,16 +138,15 @@ _PAPER = {
     "noise": published.UNSEEN_CATEGORIES_NOISE,
     "clean": published.UNSEEN_SHAPES,
     "disjoint": "",
+    "unseen": published.UNSEEN_CATEGORIES_NOISE,
 }
 _ALSO_OVERLAP = ("OMNet", "DBDNet as shipped")
 
 
-def learned_figures(
-    results: Path, name: str, seed: int, point: str, key: str
-) -> Mapping[str, Any] | None:
+def learned_figures(results: Path, name: str, point: str, key: str) -> Mapping[str, Any] | None:
     """A learned method's figures on one set after one of the two trainings."""
     held = read_row(results, name) or {"seeds": {}}
-    return held["seeds"].get(str(seed), {}).get(point, {}).get("sets", {}).get(key)
+    return points_of(held, Training(half=of_half(key))).get(point, {}).get("sets", {}).get(key)
 
 
 def _classical(results: Path, name: str, key: str) -> Line:
@@ -160,8 +159,8 @@ def _steps(results: Path, point: str, key: str) -> dict[str, list[Mapping[str, A
     found: dict[str, list[Mapping[str, Any]]] = {}
     for name, recipe in RECIPES.items():
         held = read_row(results, name)
-        for seed in held["seeds"] if recipe.step and held else ():
-            figures = learned_figures(results, name, int(seed), point, key)
+        for points in held["seeds"].values() if recipe.step and held else ():
+            figures = points.get(point, {}).get("sets", {}).get(key)
             if figures is not None:
                 found.setdefault(recipe.step, []).append(figures)
     return found

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.paper.recipes import Recipe, configuration, stages
+from benchmarks.paper.recipes import Recipe, Training, configuration, stages
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.io.files import write_atomic
 
@@ -31,7 +31,7 @@ Run = Callable[[Sequence[str]], float]  # a command line's CPU seconds
 
 def train(
     recipe: Recipe,
-    seed: int,
+    training: Training,
     folder: Path,
     *,
     pairs: int,
@@ -50,7 +50,7 @@ def train(
 
     def advance(stage: str, budget: int) -> None:
         batch = config.stages[stage].batch_size
-        line = command(recipe, seed, folder, stage, batch, budget)
+        line = command(recipe, training, folder, stage, batch, budget)
         seconds[stage] = seconds.get(stage, 0.0) + (run or _cpu_seconds)(line)
         seen[stage] = budget
         _write(folder, seen, seconds)
@@ -88,15 +88,17 @@ def affordable(pairs: int, rate: float, left_s: float) -> int:
 
 
 def command(
-    recipe: Recipe, seed: int, folder: Path, stage: str, batch: int, pairs: int
+    recipe: Recipe, training: Training, folder: Path, stage: str, batch: int, pairs: int
 ) -> list[str]:
     """The command line that trains a stage until it has seen so many pairs."""
-    epoch = len(cad_split("train"))
+    categories = "seen" if training.half else "all"
+    epoch = len(cad_split("train", "seen" if training.half else None))
     changes: dict[str, Any] = {
+        "data.categories": categories,
         "train.devices": 1,
         "train.schedule": "constant",
         "train.milestones": "()",
-        "train.seed": seed,
+        "train.seed": training.seed,
         "train.log_every": LOGGED // batch,
         "train.validate_every": CADENCE // batch,
         "train.checkpoint_every": CADENCE // batch,
