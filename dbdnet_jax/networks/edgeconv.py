@@ -9,10 +9,13 @@ for a fraction of the arithmetic and memory:
 - a GroupNorm is one affine map per channel once its statistics are known, and LeakyReLU is
   monotone, so the maximum over j needs only the maximum of the second convolution, or its minimum
   where the slope is negative; the slope has the sign of the norm's scale;
-- rows go in blocks whose edges stay in a core's cache, and are computed again in the derivative.
+- rows go in blocks whose edges stay in a core's cache; those of several blocks are computed again
+  in the derivative.
 """
 
 import math
+from collections.abc import Callable
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -91,7 +94,7 @@ def edge_moments(
 
     rows = _blocks(index, own, weight)
     zero = jnp.zeros_like(shift)
-    (mean, square), _ = jax.lax.scan(jax.checkpoint(block), (zero, zero), rows)
+    (mean, square), _ = _scan(block, (zero, zero), rows)
     return mean + shift, square - mean * mean
 
 
@@ -126,7 +129,7 @@ def edge_extremes(
 
     rows = _blocks(index, own, weight)
     zero = jnp.zeros_like(shift)
-    (mean, square), extreme = jax.lax.scan(jax.checkpoint(block), (zero, zero), rows)
+    (mean, square), extreme = _scan(block, (zero, zero), rows)
     extreme = extreme.reshape(-1, kernel.shape[1])[:n]
     return extreme + bias[None, :], mean + shift + bias, square - mean * mean
 
@@ -153,6 +156,14 @@ def _add_moments(
     centred = edge - shift[None, None, :]
     mean, square = moments
     return mean + weight @ jnp.sum(centred, 0), square + weight @ jnp.sum(centred * centred, 0)
+
+
+def _scan(
+    block: Callable[[Moments, Block], tuple[Moments, Any]], zero: Moments, rows: Block
+) -> tuple[Moments, Any]:
+    """Block after block; the derivative keeps the edges of one, and computes those of several."""
+    several = len(rows[0]) > 1
+    return jax.lax.scan(jax.checkpoint(block) if several else block, zero, rows)
 
 
 def _blocks(
