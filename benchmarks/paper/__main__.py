@@ -37,9 +37,8 @@ METHODS = flags.DEFINE_list("methods", list(RECIPES), "Which learned methods.")
 PAIRS = flags.DEFINE_integer("pairs", 1600, "Pairs that each method is trained on.", lower_bound=1)
 MINUTES = flags.DEFINE_float("minutes", 30.0, "Minutes of one core for each method.", lower_bound=0)
 TRAINED = flags.DEFINE_multi_enum("points", POINTS, POINTS, "Train for the pairs, or the minutes.")
-HALVES = ("all", "seen")
 CATEGORIES = flags.DEFINE_multi_enum(
-    "categories", HALVES, HALVES, "Train on all categories, or on the half that is seen."
+    "categories", ["all", "seen"], ["all", "seen"], "Train on all, or on the half that is seen."
 )
 SEEDS = flags.DEFINE_integer("seeds", 3, "Seeds of each step of the ladder.", lower_bound=1)
 RUNS = flags.DEFINE_string("runs", "runs/paper", "Where the runs lie.")
@@ -71,11 +70,10 @@ def main(argv: list[str]) -> None:
             print(public.tables(Path(PUBLIC.value), {key: sets[key] for key in public.SETS}))
             return
         for name in METHODS.value:
-            recipe, halves = RECIPES[name], CATEGORIES.value if TRAIN.value else ()
-            for half in halves:
-                for training in trainings(recipe, SEEDS.value, half == "seen"):
+            for categories in CATEGORIES.value if TRAIN.value else ():
+                for training in trainings(RECIPES[name], SEEDS.value, categories == "seen"):
                     train(
-                        recipe,
+                        RECIPES[name],
                         training,
                         training.folder(runs, name),
                         pairs=PAIRS.value,

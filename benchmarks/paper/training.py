@@ -91,10 +91,10 @@ def command(
     recipe: Recipe, training: Training, folder: Path, stage: str, batch: int, pairs: int
 ) -> list[str]:
     """The command line that trains a stage until it has seen so many pairs."""
-    categories = "seen" if training.half else "all"
-    epoch = len(cad_split("train", "seen" if training.half else None))
+    half = "seen" if training.half else None
+    epoch = len(cad_split("train", half))
     changes: dict[str, Any] = {
-        "data.categories": categories,
+        "data.categories": half or "all",
         "train.devices": 1,
         "train.schedule": "constant",
         "train.milestones": "()",

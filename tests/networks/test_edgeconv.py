@@ -109,6 +109,18 @@ def test_rows_in_several_blocks_give_what_one_block_does(monkeypatch, x64):
         assert_close(found, expected, FLOAT64)
 
 
+def test_the_derivative_computes_edges_again_only_where_they_take_several_blocks(monkeypatch):
+    layers, x = cast(LAYERS, np.float32), jnp.asarray(random_cloud(11, N), jnp.float32)
+
+    def computes_again():
+        traced = jax.make_jaxpr(lambda x: edge_conv_eagerly(x, N, *layers))(x)
+        return "remat" in str(traced) or "checkpoint" in str(traced)
+
+    assert not computes_again()
+    monkeypatch.setattr(edgeconv, "BLOCK_VALUES", 5 * K * WIDTH)
+    assert computes_again()
+
+
 def test_edge_conv_of_degenerate_clouds_is_finite(degenerate):
     layers = cast(LAYERS, np.float32)
     x = jnp.asarray(degenerate, jnp.float32)
