@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from ml_collections import ConfigDict
 
-from configs import cad, cad_short, modelnet, threedmatch
+from configs import cad, cad_long, cad_short, modelnet, threedmatch
 from configs.peers import (
     dcp,
     dcp_cad,
@@ -36,7 +36,13 @@ from dbdnet_jax.training.task import RunConfig, TrainConfig
 from tests.ladder import LADDER
 
 ROOT = Path(__file__).parents[1]
-CONFIGS = {"modelnet": modelnet, "threedmatch": threedmatch, "cad": cad, "cad_short": cad_short}
+CONFIGS = {
+    "modelnet": modelnet,
+    "threedmatch": threedmatch,
+    "cad": cad,
+    "cad_short": cad_short,
+    "cad_long": cad_long,
+}
 PEERS = {
     "masknet": masknet,
     "dcp": dcp,
@@ -153,7 +159,7 @@ def test_threedmatch_is_the_papers():
 
 
 def test_the_cad_configurations_keep_the_papers_protocol():
-    for config in (cad, cad_short):
+    for config in (cad, cad_short, cad_long):
         assert read_config(config.get_config()).protocol == Protocol()
 
 
