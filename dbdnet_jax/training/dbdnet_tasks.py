@@ -7,8 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from dbdnet_jax.errors import CheckpointError
-from dbdnet_jax.networks.dbdnet.config import ModelConfig
-from dbdnet_jax.networks.params import Params
 from dbdnet_jax.training.dbdnet import (
     joint_loss_of,
     overlap_loss_of,
@@ -56,7 +54,7 @@ def registration_task(config: RunConfig, run_dir: str | Path) -> Task:
             f"{config.model.overlap!r}. Change one of the two."
         )
     masked = prior and stage.masks == "predicted"
-    frozen = trained_overlap(config.model, run_dir) if masked else None
+    frozen = trained_overlap(run_dir) if masked else None
     radius = config.protocol.overlap_radius
     return Task(
         initial_params(config).registration,
@@ -97,7 +95,6 @@ def both_trained(config: RunConfig, run_dir: str | Path) -> dict[str, Any]:
     params, where = None, str(run_dir)
     if any((Path(run_dir) / stage).is_dir() for stage in NETWORKS):
         params = load_best(run_dir, joint=False)
-        _require_model(params, config.model, run_dir)
     elif config.train.start:
         params, where = load_start(config), config.train.start
     if params is None or params.overlap is None or params.registration is None:
@@ -109,7 +106,7 @@ def both_trained(config: RunConfig, run_dir: str | Path) -> dict[str, Any]:
     return params.networks
 
 
-def trained_overlap(model: ModelConfig, run_dir: str | Path) -> Any:
+def trained_overlap(run_dir: str | Path) -> Any:
     """The run's overlap network, as it was before any joint stage."""
     has_one = (Path(run_dir) / "overlap").is_dir()
     params = load_best(run_dir, joint=False) if has_one else None
@@ -118,13 +115,4 @@ def trained_overlap(model: ModelConfig, run_dir: str | Path) -> Any:
             f"the registration stage needs a trained overlap network; {run_dir} has none. Train "
             "it first (--stage=overlap or both), or set config.registration.masks='truth'."
         )
-    _require_model(params, model, run_dir)
     return params.overlap
-
-
-def _require_model(params: Params, model: ModelConfig, run_dir: str | Path) -> None:
-    if params.config != model:
-        raise CheckpointError(
-            f"both networks of a run must be of one configuration; {run_dir} holds one of "
-            f"{params.config}, config.model is {model}. Give another --run_dir."
-        )

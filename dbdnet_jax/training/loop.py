@@ -32,7 +32,7 @@ from dbdnet_jax.training.parallel import (
     training_mesh,
 )
 from dbdnet_jax.training.preemption import Preempted, stop_requests
-from dbdnet_jax.training.run_folder import write_stage
+from dbdnet_jax.training.run_folder import require_same_run, write_stage
 from dbdnet_jax.training.runlog import RunLog
 from dbdnet_jax.training.step import StepMetrics, TrainState, init_state, train_step, weights_of
 from dbdnet_jax.training.table import STAGES
@@ -47,15 +47,17 @@ def fit(config: RunConfig, stage: str, run_dir: str | Path, stream: PairStream) 
     A finished stage returns at once.
 
     Raises:
-        CheckpointError: all checkpoints damaged, or a folder of another configuration.
+        CheckpointError: all checkpoints damaged, or a run of another configuration.
+        ValueError: devices or parts that cannot share the batch.
         BlockingIOError: another process trains this stage in this folder; says which.
         FloatingPointError: a loss term or a gradient is not finite; says which, at which step, and
             where the last good state is.
         Preempted: SIGTERM, SIGHUP or SIGINT came; the state after the step of then is saved.
     """
     folder = Path(run_dir) / stage
+    record = folder, stage_record(config, stage), stage_defaults(config)
+    require_same_run(*record)
     task = STAGES[config.method][stage].make_task(config, run_dir)
-    write_stage(folder, stage_record(config, stage), stage_defaults(config))
     part = config.stages[stage]
     run_task(
         task,
@@ -65,6 +67,7 @@ def fit(config: RunConfig, stage: str, run_dir: str | Path, stream: PairStream) 
         epochs=part.epochs,
         batch_size=part.batch_size,
         learning_rate=part.learning_rate,
+        begin=functools.partial(write_stage, *record),
     )
 
 
@@ -77,8 +80,9 @@ def run_task(
     epochs: float,
     batch_size: int,
     learning_rate: float,
+    begin: Callable[[], None] = lambda: None,
 ) -> None:
-    """`fit` for any task."""
+    """`fit` for any task; ``begin`` is called once nothing stands in the way, under the lock."""
     epoch_steps = max(1, stream.epoch_pairs // batch_size)
     total = max(1, round(epochs * epoch_steps))
     schedule = make_schedule(
@@ -101,6 +105,7 @@ def run_task(
     _require_parts(task, batch_size // mesh.size, train.accumulate)
     alone = sole_training(folder) if jax.process_index() == 0 else contextlib.nullcontext()
     with alone, Checkpoints(folder) as checkpoints:
+        begin()
         state = init_state(
             task.trainable, optimizer, ema_decay=train.ema_decay, batch_stats=task.batch_stats
         )

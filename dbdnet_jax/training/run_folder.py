@@ -6,6 +6,7 @@ further); in it ``stage.json`` says what the stage trains, of which method, besi
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -25,27 +26,42 @@ def write_stage(
 ) -> None:
     """Put ``stage.json`` into a stage's folder, or check that the one there says the same.
 
-    What an older release did not write is taken from ``defaults``, a part of a record.
-
     Raises:
-        CheckpointError: the folder is of another configuration; names the first field that differs.
+        CheckpointError: as `require_same_run`.
     """
+    require_same_run(folder, record, defaults)
     path = folder / "stage.json"
-    record = json.loads(json.dumps(record))
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
         write_atomic(path, (json.dumps(record, indent=1) + "\n").encode())
-        return
-    wanted, known = _flatten(record), _flatten(json.loads(json.dumps(defaults or {})))
-    found = {name: known[name] for name in known if name in wanted}
-    found |= _flatten(read_stage(folder))
-    for name in sorted(found.keys() | wanted.keys()):
-        if found.get(name) != wanted.get(name):
-            raise CheckpointError(
-                f"a run can only go on with the configuration it was started with; {folder} has "
-                f"{name} = {found.get(name)}, this configuration {wanted.get(name)}. Give another "
-                "--run_dir, or delete that folder to start anew."
-            )
+
+
+def require_same_run(
+    folder: Path, record: dict[str, Any], defaults: dict[str, Any] | None = None
+) -> None:
+    """Refuse a stage of another configuration than was begun in ``folder``, or another network.
+
+    The other stages of the run have settings of their own, but are of the same method and model.
+    What an older release did not write is taken from ``defaults``, a part of a record.
+
+    Raises:
+        CheckpointError: names the first field that differs.
+    """
+    wanted, known = _flatten(_plain(record)), _flatten(_plain(defaults or {}))
+    for path in sorted(folder.parent.glob("*/stage.json")):
+        found = {name: known[name] for name in known if name in wanted}
+        found |= _flatten(_plain(read_stage(path.parent)))
+        names = found.keys() | wanted.keys()
+        if path.parent != folder:
+            names = {name for name in names if name.split(".")[0] in ("method", "model")}
+        for name in sorted(names):
+            if found.get(name) != wanted.get(name):
+                raise CheckpointError(
+                    "a run can only go on with the configuration it was started with; "
+                    f"{path.parent} has {name} = {found.get(name)}, this configuration "
+                    f"{wanted.get(name)}. Give another --run_dir, or delete that folder to start "
+                    "anew."
+                )
 
 
 def read_stage(folder: Path) -> dict[str, Any]:
@@ -71,10 +87,11 @@ def load_best(run_dir: str | Path, *, joint: bool = True) -> Params:
     Those of the joint stage where it has any, unless ``joint`` is False.
 
     Raises:
-        CheckpointError: no stage has a validated checkpoint, or one is damaged.
+        CheckpointError: no stage has a validated checkpoint, one is damaged, or the stages' models
+            differ.
     """
     networks: dict[str, Any] = {}
-    model = None
+    models: dict[Path, Any] = {}
     method = _method(Path(run_dir))
     parts = LEARNED[method].parts
     for stage in (*parts, JOINT) if joint else parts:
@@ -86,13 +103,13 @@ def load_best(run_dir: str | Path, *, joint: bool = True) -> Params:
             if step is not None:
                 found = checkpoints.restore_weights(step)
                 networks |= found if stage == JOINT else {stage: found}
-                model = _model_config(folder, method)
-    if model is None:
+                models[folder] = _model_config(folder, method)
+    if not models:
         raise CheckpointError(
             f"a run folder must hold a validated checkpoint; {run_dir} has none. Train first: "
             "python train.py --config=configs/NAME.py --run_dir=..."
         )
-    return Params(networks, model)
+    return Params(networks, _only_model(models))
 
 
 def was_trained(run_dir: str | Path) -> bool:
@@ -125,6 +142,26 @@ def _model_config(folder: Path, method: str) -> Any:
             f"{LEARNED[method].config.__name__} ({first_line(error)}). Use the version of "
             "dbdnet_jax that trained it, or train again."
         ) from error
+
+
+def _only_model(models: dict[Path, Any]) -> Any:
+    """The configuration of a run's networks, which that of every stage must be."""
+    (first, model), *others = models.items()
+    for folder, other in others:
+        for field in dataclasses.fields(model):
+            values = getattr(model, field.name), getattr(other, field.name)
+            if values[0] != values[1]:
+                raise CheckpointError(
+                    f"all networks of a run must be of one configuration; {first} has "
+                    f"model.{field.name} = {values[0]}, {folder} {values[1]}. Delete one of the "
+                    "two and train it again as the other one, or in another --run_dir."
+                )
+    return model
+
+
+def _plain(record: dict[str, Any]) -> dict[str, Any]:
+    """A record as JSON gives it back, with the method that it leaves out."""
+    return {"method": DEFAULT_METHOD, **json.loads(json.dumps(record))}
 
 
 def _flatten(record: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -264,6 +264,28 @@ def test_the_joint_stage_needs_both_networks(run_dir, tmp_path):
         fit(CONFIG, "joint", tmp_path, source())
 
 
+def test_a_stage_of_another_model_is_refused_before_it_trains(run_dir, tmp_path):
+    (tmp_path / "overlap").symlink_to(run_dir / "overlap")
+    config = CONFIG.with_stage("registration", masks="perturbed")
+    config = dataclasses.replace(config, model=dataclasses.replace(config.model, min_points=13))
+    with pytest.raises(CheckpointError, match=r"overlap has model\.min_points = 12, .* 13\. Give"):
+        fit(config, "registration", tmp_path, source())
+    assert not (tmp_path / "registration").exists()
+
+
+def test_a_batch_that_cannot_be_shared_leaves_nothing_that_refuses_the_advice(
+    tmp_path, monkeypatch
+):
+    quick = STAGES["dbdnet"]["overlap"]._replace(make_task=stand_in_train.task)
+    monkeypatch.setitem(STAGES["dbdnet"], "overlap", quick)
+    train = dataclasses.replace(CONFIG.train, devices=2)
+    config = dataclasses.replace(CONFIG, train=train).with_stage("overlap", epochs=1.0)
+    with pytest.raises(ValueError, match="divisible by the 2 devices.*Use a batch_size of 2"):
+        fit(config.with_stage("overlap", batch_size=3), "overlap", tmp_path, source())
+    fit(config.with_stage("overlap", batch_size=2), "overlap", tmp_path, source())
+    assert (tmp_path / "overlap" / "stage.json").is_file()
+
+
 def test_registration_needs_the_overlap_network(tmp_path):
     with pytest.raises(CheckpointError, match="--stage=overlap or both"):
         fit(CONFIG, "registration", tmp_path, source())

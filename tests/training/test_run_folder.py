@@ -28,6 +28,19 @@ def test_a_stage_goes_on_only_with_its_own_configuration(tmp_path):
         write_stage(tmp_path / "overlap", {"model": {"heads": 2}, "train": {"seed": 0}})
 
 
+def test_the_stages_of_a_run_are_of_one_network_and_each_of_its_own_settings(tmp_path):
+    defaults = {"model": {"heads": 4, "overlap_passes": 1}}
+    write_stage(tmp_path / "overlap", {"model": {"heads": 4}, "overlap": {"epochs": 3}})
+    record = {"model": {"heads": 4, "overlap_passes": 1}, "registration": {"epochs": 5}}
+    write_stage(tmp_path / "registration", record, defaults)
+    record = {"model": {"heads": 4, "overlap_passes": 3}}
+    with pytest.raises(CheckpointError, match=r"overlap has model\.overlap_passes = 1, .* 3\."):
+        write_stage(tmp_path / "joint", record, defaults)
+    with pytest.raises(CheckpointError, match=r"has method = dbdnet, this configuration masknet"):
+        write_stage(tmp_path / "masknet", {"method": "masknet", **record})
+    assert not (tmp_path / "joint").exists() and not (tmp_path / "masknet").exists()
+
+
 def save_run(run_dir, stage: str, config: dict, error: float | None, *, ema_decay: float = 0.0):
     saved = state(3, ema_decay=ema_decay)
     if ema_decay:
@@ -47,6 +60,15 @@ def test_load_best_takes_each_stage_and_prefers_the_average(tmp_path):
     assert_same(params.overlap, overlap.params)
     registration = save_run(tmp_path, "registration", config, 0.5, ema_decay=0.9)
     assert_same(load_best(tmp_path).registration, registration.ema)
+
+
+def test_load_best_does_not_put_networks_of_two_configurations_together(tmp_path):
+    save_run(tmp_path, "overlap", {}, 0.5)
+    save_run(tmp_path, "registration", {}, 0.5)
+    path = tmp_path / "registration" / "stage.json"
+    path.write_text(json.dumps({"model": {"heads": 2}}))
+    with pytest.raises(CheckpointError, match=r"overlap has model\.heads = 4, .*registration 2\."):
+        load_best(tmp_path)
 
 
 def test_load_best_says_what_is_missing_or_wrong(tmp_path):
