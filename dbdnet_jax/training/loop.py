@@ -172,9 +172,9 @@ class _Loop:
                 waiting.append(metrics)
                 at_row = done % train.log_every == 0 or done == self.total
                 stopping = stop.asked(done)
-                # One step late, so that the device always has the next one to work on. A bad step
-                # gives back the state it was given, so the one after it did too.
-                while len(waiting) > (0 if at_row or stopping else 1):
+                # One step late, so that the device always has the next one to work on: drawn from
+                # the same arrays, after a bad step, it is that step again. A batch is not.
+                while len(waiting) > (0 if at_row or stopping or self.stream.batched else 1):
                     window.append(_scalars(jax.device_get(waiting.pop(0))))
                     self._require_finite(window, state, "in the step")
                     bar.update(self.batch_size)

@@ -89,8 +89,9 @@ def train_step(
     The devices of ``mesh`` share the pairs; on a GPU or TPU each takes its own in ``accumulate``
     parts, one after another. ``remat`` recomputes the loss for its gradient; a ``precision`` of
     "bfloat16" is that of its products. ``loss`` is a task's (`training.task`). Where the loss, a
-    term or the gradient is not finite the state comes back as it was, step count included: the same
-    step would be taken again, and fail again, until the caller stops.
+    term or the gradient is not finite the state comes back as it was, step count included: from the
+    same arrays the same step would be taken again, and fail again, until the caller stops. From the
+    next batch it would be another one, so the caller looks at each before it takes the next.
     """
     key = jax.random.fold_in(key, state.step)
     loss = _with_bfloat16(loss) if precision == "bfloat16" else loss

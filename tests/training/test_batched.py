@@ -13,6 +13,7 @@ import numpy as np
 import optax
 import pytest
 
+from dbdnet_jax.training.checkpoint import Checkpoints
 from dbdnet_jax.training.parallel import training_mesh
 from dbdnet_jax.training.step import init_state, train_step
 from tests import stand_in
@@ -31,8 +32,11 @@ train(Path(sys.argv[3]), 4)
 """
 
 
-def train(folder, devices, batched=True):
-    """The stand-in's run; where it is batched, of the same pairs, drawn before each step."""
+def train(folder, devices, batched=True, *, log_every=1, bad_step=None):
+    """The stand-in's run; where it is batched, of the same pairs, drawn before each step.
+
+    The batch of ``bad_step`` is NaN.
+    """
     source = stream = stand_in.source()
     held = jnp.asarray(next(source.arrays(0)))
 
@@ -48,11 +52,17 @@ def train(folder, devices, batched=True):
         own = stand_in.BATCH // jax.process_count()
         rows = slice(jax.process_index() * own, (jax.process_index() + 1) * own)
         for step in itertools.count(start):
-            yield jax.tree.map(lambda leaf: np.asarray(leaf)[rows], drawn(step))
+            batch = jax.tree.map(lambda leaf: np.array(leaf)[rows], drawn(step))
+            if step == bad_step:
+                batch.target.points[:] = np.nan
+            yield batch
 
     if batched:
         stream = source._replace(arrays=arrays, draw=lambda key, number, pair: pair, batched=True)
-    stand_in.train(folder, stream, dataclasses.replace(stand_in.TRAIN, devices=devices))
+    config = dataclasses.replace(
+        stand_in.TRAIN, devices=devices, log_every=log_every, checkpoint_every=4
+    )
+    stand_in.train(folder, stream, config)
 
 
 def curve(folder):
@@ -73,6 +83,17 @@ def test_devices_take_their_rows_of_a_batch(tmp_path, monkeypatch, expected, dev
     monkeypatch.setattr(jax, "default_backend", lambda: backend)
     train(tmp_path, devices)
     assert_close(curve(tmp_path), expected, FLOAT32)
+
+
+@pytest.mark.parametrize("bad_step", [0, 5])
+def test_a_bad_batch_is_named_and_nothing_is_taken_after_it(tmp_path, expected, bad_step):
+    with pytest.raises(FloatingPointError, match=f"is nan in the step after step {bad_step} of"):
+        train(tmp_path, 1, log_every=4, bad_step=bad_step)
+    with Checkpoints(tmp_path) as checkpoints:
+        assert (checkpoints.latest_step() or 0) == bad_step
+    train(tmp_path, 1, log_every=4)  # the data mended, the run goes on as if nothing had been
+    losses = expected[:, 3].reshape(3, 4).mean(axis=1)
+    assert_close(curve(tmp_path)[:, 3], losses, FLOAT32)
 
 
 @pytest.mark.slow
