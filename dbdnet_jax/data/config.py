@@ -2,9 +2,11 @@
 
 import dataclasses
 
+from dbdnet_jax.data.cad import HALVES
 from dbdnet_jax.data.mixture import Mixture
 
 DATA_SETS = ("cad", "modelnet40", "threedmatch")
+CATEGORIES = ("all", *HALVES)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,10 +21,22 @@ class DataConfig:
     mixture: Mixture = Mixture()  # shares of pairs as the world is; ``augment`` is of the others
 
     def __post_init__(self) -> None:
-        """Refuse an unknown data set."""
-        if self.name not in DATA_SETS:
+        """Refuse unknown choices, and what a data set has not."""
+        for name, choices in (("name", DATA_SETS), ("categories", CATEGORIES)):
+            if getattr(self, name) not in choices:
+                raise ValueError(
+                    f"config.data.{name} must be one of {choices}; got {getattr(self, name)!r}. "
+                    "Choose one."
+                )
+        if self.folder and self.name == "cad":
             raise ValueError(
-                f"config.data.name must be one of {DATA_SETS}; got {self.name!r}. Choose one."
+                "config.data.folder must be '' for 'cad', which is in the package; got "
+                f"{self.folder!r}. Leave it out, or set config.data.name."
+            )
+        if self.categories != "all" and self.name == "threedmatch":
+            raise ValueError(
+                "config.data.categories must be 'all' for 'threedmatch', whose scans have none; "
+                f"got {self.categories!r}. Use 'all'."
             )
         if self.procedural < 0 or (self.procedural and self.name != "cad"):
             raise ValueError(
@@ -38,4 +52,16 @@ class DataConfig:
             raise ValueError(
                 "config.data.mixture must be 0 for 'threedmatch', whose pairs are read; got "
                 f"{self.mixture}. Set its shares to 0."
+            )
+
+    def require_folder(self) -> None:
+        """Refuse a downloaded data set that is to be read, but from nowhere.
+
+        Raises:
+            ValueError: names the field.
+        """
+        if self.name != "cad" and not self.folder:
+            raise ValueError(
+                f"config.data.folder must be where {self.name} stands; it is not set. Give "
+                "--config.data.folder=PATH."
             )

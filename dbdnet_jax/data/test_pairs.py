@@ -21,6 +21,7 @@ from dbdnet_jax.types import Pair
 
 TEST_SEED = 2024  # not the run's: results of runs with other seeds compare
 CAD_PAIRS = 200
+BENCHMARKS = ("3DMatch", "3DLoMatch")  # of scans: of much overlap, and of little
 
 
 class PairSet(NamedTuple):
@@ -38,18 +39,25 @@ class PairSet(NamedTuple):
 
 
 def load_test_pairs(
-    data: DataConfig, protocol: Protocol, folder: str | Path, benchmark: str = "3DMatch"
+    data: DataConfig, protocol: Protocol, folder: str | Path, benchmark: str = BENCHMARKS[0]
 ) -> PairSet:
     """The test pairs of a data set under a protocol.
 
     A network trained on the seen half of the classes is tested on the unseen one, and the other
     way round. Where the package has no frozen set for the protocol, the pairs are drawn from
-    `TEST_SEED` and written to ``folder``. ``benchmark`` is "3DMatch" or "3DLoMatch", for scans.
+    `TEST_SEED` and written to ``folder``. ``benchmark`` is one of `BENCHMARKS`, for scans.
 
     Raises:
         FileNotFoundError: the data set's folder, or a file in it, is not there.
-        ValueError: a damaged file.
+        ValueError: no folder given, a damaged file, or a benchmark that the data set has not.
     """
+    data.require_folder()
+    if benchmark != BENCHMARKS[0] and data.name != "threedmatch":
+        raise ValueError(
+            f"the benchmark must be {BENCHMARKS[0]!r} unless config.data.name is 'threedmatch': "
+            f"only scans have another; got {benchmark!r} for {data.name!r}. Leave --benchmark out, "
+            "or use configs/threedmatch.py."
+        )
     if data.name == "threedmatch":
         return _scans(data.folder, protocol, benchmark, Path(folder) / "overlap_labels")
     half = None if data.categories == "all" else HALVES[1 - HALVES.index(data.categories)]

@@ -55,13 +55,9 @@ def load_training_pairs(
 
     Raises:
         FileNotFoundError: its folder, or a file in it, is not there; says where to get it.
-        ValueError: no folder given, a damaged file, or an unknown choice.
+        ValueError: no folder given, or a damaged file.
     """
-    if data.name != "cad" and not data.folder:
-        raise ValueError(
-            f"config.data.folder must be where {data.name} stands; it is not set. Give "
-            "--config.data.folder=PATH."
-        )
+    data.require_folder()
     if data.name == "threedmatch":
         return _scans(data.folder, protocol, seed, validation_pairs, batch_size)
     train, validation = load_training_shapes(data)
