@@ -22,10 +22,10 @@ import jax
 from absl import app, flags, logging
 from ml_collections import config_flags
 
-from dbdnet_jax.data.test_pairs import load_test_pairs
+from dbdnet_jax.data.test_pairs import BENCHMARKS, load_test_pairs
 from dbdnet_jax.drawing.evaluation_page import evaluation_page
 from dbdnet_jax.errors import MissingExtraError, require_drawing
-from dbdnet_jax.evaluation.methods import Weights
+from dbdnet_jax.evaluation.methods import Weights, load_weights
 from dbdnet_jax.evaluation.run import evaluate
 from dbdnet_jax.evaluation.sweep import SWEEP_PAIRS, SWEEPS, render_sweep, save_sweep, sweep
 from dbdnet_jax.evaluation.tables import render, save
@@ -43,7 +43,7 @@ RUN_DIR = flags.DEFINE_string("run_dir", None, "The run to score; runs/NAME if n
 PARAMS = flags.DEFINE_multi_string(
     "params", None, "Weights: a .npz file or a name; else the run's best. May be given repeatedly."
 )
-BENCHMARK = flags.DEFINE_enum("benchmark", "3DMatch", ["3DMatch", "3DLoMatch"], "For scans.")
+BENCHMARK = flags.DEFINE_enum("benchmark", BENCHMARKS[0], BENCHMARKS, "For scans.")
 COUNT = flags.DEFINE_integer("count", None, "Only the first pairs.", lower_bound=1)
 SWEEP = flags.DEFINE_multi_enum(
     "sweep", None, list(SWEEPS), "Vary this part of the protocol instead; may be given repeatedly."
@@ -61,7 +61,7 @@ def choose_weights(
     configuration of that name.
     """
     if params:
-        return [Weights(Path(name).stem, load_named(name)) for name in params]
+        return load_weights(params)
     default = Path("runs") / config_name
     packaged = (PRETRAINED / f"{config_name}.npz").is_file()
     if run_dir is not None or was_trained(default) or not packaged:
@@ -107,7 +107,7 @@ def main(argv: list[str]) -> None:
     """Choose the weights, score them, print and write the table."""
     if argv[1:]:
         raise app.UsageError(f"arguments must be flags such as --params=cad; got {argv[1:]}.")
-    if SWEEP.value and (REPORT.value or BENCHMARK.value != "3DMatch"):
+    if SWEEP.value and (REPORT.value or BENCHMARK.value != BENCHMARKS[0]):
         raise app.UsageError(
             "--sweep goes without --report and --benchmark; a later call with --report alone draws "
             "the sweeps that were saved."

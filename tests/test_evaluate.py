@@ -13,13 +13,13 @@ from configs import cad
 from dbdnet_jax.data import test_pairs
 from dbdnet_jax.data.frozen import cad_test_pairs
 from dbdnet_jax.data.modelnet40 import FILES, load_modelnet40
-from dbdnet_jax.evaluation.methods import Weights
+from dbdnet_jax.evaluation.methods import Weights, labels_of, load_weights
 from dbdnet_jax.evaluation.run import evaluate
 from dbdnet_jax.metrics.recall import correspondence_rmse_m
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.params import Params, unflatten
 from dbdnet_jax.networks.table import parameter_shapes
-from dbdnet_jax.networks.weights import save_params
+from dbdnet_jax.networks.weights import PRETRAINED, save_params
 from dbdnet_jax.training.config import RunConfig, read_config
 from tests.data.test_modelnet40 import LABELS, write_file
 from tests.data.threedmatch_folder import SCENES, write_folder
@@ -123,6 +123,35 @@ def test_scans_are_the_benchmarks_pairs_and_come_without_normals(tmp_path):
             source.dtype == np.float32 and 0 < correspondence_rmse_m(motion, source, target) < 0.04
         )
     assert [len(part) for part in first.scans.first(2)] == [2, 2, 2]
+
+
+def test_pairs_are_not_read_from_nowhere_nor_is_a_benchmark_of_scans_passed_over(tmp_path):
+    with pytest.raises(ValueError, match=r"config\.data\.folder must be where modelnet40 stands"):
+        asked_for(cad_config(data__name="modelnet40"), tmp_path)
+    with pytest.raises(ValueError, match="must be '3DMatch' unless .* got '3DLoMatch' for 'cad'"):
+        asked_for(cad_config(), tmp_path, "3DLoMatch")
+
+
+@pytest.mark.parametrize(
+    ("given", "labels"),
+    [
+        (["runs/a/params.npz", "runs/b/params.npz"], ["a", "b"]),
+        (["one/a/params.npz", "two/a/params.npz", "mine.npz"], ["one/a", "two/a", "mine"]),
+        (["runs/a/best.npz", "runs/b/best.npz"], ["a/best", "b/best"]),
+        (["cad", "runs/cad/params.npz"], ["cad", "runs/cad"]),
+        (["a.npz", "a/params.npz"], ["a", "params"]),
+        (["runs/a/params.npz"], ["a"]),
+    ],
+)
+def test_weights_are_called_by_what_tells_them_apart(given, labels):
+    assert labels_of(given) == labels
+
+
+@pytest.mark.parametrize("again", ["runs/../mine.npz", "mine.npz", "PACKAGED"])
+def test_the_same_weights_twice_are_refused(again):
+    again = again.replace("PACKAGED", str(PRETRAINED / "cad.npz"))
+    with pytest.raises(ValueError, match=f"must each be of another file; got {again} for .* Leave"):
+        load_weights(["mine.npz", "cad", again])
 
 
 def test_params_without_a_registration_network_are_refused(tmp_path):

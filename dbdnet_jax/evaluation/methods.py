@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -16,6 +17,7 @@ from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.initial import init_params
 from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.table import learned, parts_of
+from dbdnet_jax.networks.weights import PRETRAINED, load_named
 from dbdnet_jax.types import Answer, Cloud, Pair, Rigid
 
 Answering = Callable[[Pair], Answer]
@@ -58,6 +60,48 @@ class Weights(NamedTuple):
 
     label: str
     params: Params
+
+
+def load_weights(names: Sequence[str]) -> list[Weights]:
+    """Weights by the paths of files, or their names in the package, each with a label of its own.
+
+    Raises:
+        FileNotFoundError: no such file.
+        CheckpointError: no such name; otherwise as `load_params`.
+        ValueError: the same file twice.
+    """
+    labels = labels_of(names)
+    return [Weights(*entry) for entry in zip(labels, map(load_named, names), strict=True)]
+
+
+def labels_of(names: Sequence[str]) -> list[str]:
+    """What tells weights apart: the shortest end of each path; a run's folder for its params.npz.
+
+    Raises:
+        ValueError: the same file twice.
+    """
+    paths: dict[Path, tuple[str, ...]] = {}
+    for name in names:
+        own = name.endswith(".npz")
+        file = (Path(name) if own else PRETRAINED / f"{name}.npz").resolve()
+        if file in paths:
+            raise ValueError(
+                f"weights must each be of another file; got {name} for {file}, which was given "
+                "before. Leave one of the two out."
+            )
+        paths[file] = file.with_suffix("").parts if own else (name,)
+    whole = list(paths.values())
+    of_runs = [path[:-1] if path[-1] == "params" else path for path in whole]
+    if len(set(of_runs)) == len(whole):
+        whole = of_runs
+    return [_shortest_end(path, [other for other in whole if other != path]) for path in whole]
+
+
+def _shortest_end(path: tuple[str, ...], others: Sequence[tuple[str, ...]]) -> str:
+    """The last parts of a path, as many as it takes to be the end of none of the others."""
+    counts = range(1, len(path))
+    differing = (n for n in counts if all(path[-n:] != other[-n:] for other in others))
+    return "/".join(path[-next(differing, len(path)) :])
 
 
 def make_methods(weights: Sequence[Weights], seed: int) -> list[Method]:
