@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 
 from dbdnet_jax.io.files import write_atomic
+from dbdnet_jax.io.workers import available_cores
 
 SIZE = 2048  # of the product that measures the machine
 LIBRARIES = ("jax", "jaxlib", "flax", "optax", "numpy")
@@ -85,7 +86,7 @@ def record(module: str, figures: dict[str, Any]) -> dict[str, Any]:
         "python": platform.python_version(),
         "versions": {library: version(library) for library in LIBRARIES},
         "cpu": processor(),
-        "cores": len(os.sched_getaffinity(0)) if sys.platform == "linux" else os.cpu_count(),
+        "cores": len(available_cores()),
         "backend": jax.default_backend(),
         "devices": jax.device_count(),
         "xla_flags": os.environ.get("XLA_FLAGS", ""),

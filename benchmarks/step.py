@@ -13,7 +13,6 @@ With a released checkpoint: seconds to convert it, and the time of an answer wit
 """
 
 import functools
-import os
 import time
 
 import jax
@@ -33,6 +32,7 @@ from benchmarks.machine import (
 )
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.training_pairs import PairStream, pairs_of_shapes
+from dbdnet_jax.io.workers import available_cores
 from dbdnet_jax.networks.dbdnet.register import register
 from dbdnet_jax.networks.dbdnet.released import from_released
 from dbdnet_jax.networks.initial import init_params
@@ -103,7 +103,7 @@ def main(argv: list[str]) -> None:
     # The benchmark reads no stage's results, so both stages can run on fresh parameters.
     overrides.registration.masks = "truth"
     config = read_config(overrides)
-    jax.config.update("jax_num_cpu_devices", config.train.devices or os.cpu_count() or 1)
+    jax.config.update("jax_num_cpu_devices", config.train.devices or len(available_cores()))
     shapes = cad_split("val")
     stream = pairs_of_shapes(shapes, shapes, config.protocol, seed=0, validation_pairs=1)
     pair = jax.tree.map(lambda leaf: np.asarray(leaf)[0], stream.validation)

@@ -1,6 +1,5 @@
 """Every method on the same test pairs, shared among devices and processes: errors and time."""
 
-import os
 import time
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -22,6 +21,7 @@ from dbdnet_jax.evaluation.methods import (
     make_methods,
     possible,
 )
+from dbdnet_jax.io.workers import available_cores
 from dbdnet_jax.metrics.pose import (
     Confusion,
     OverlapSummary,
@@ -126,9 +126,11 @@ def evaluate(
 
 
 def _describe(mesh: Mesh) -> str:
-    """The hardware; where several devices shared the pairs, how many."""
+    """The hardware that there was to use; where several devices shared the pairs, how many."""
     kind, sharing = mesh.devices.flat[0].device_kind, jax.process_count() * mesh.size
-    return f"{kind}, {os.cpu_count()} cores" + (f", {sharing} devices" if sharing > 1 else "")
+    return f"{kind}, {len(available_cores())} cores" + (
+        f", {sharing} devices" if sharing > 1 else ""
+    )
 
 
 class _Scored(NamedTuple):
