@@ -20,10 +20,11 @@ import numpy as np
 from scipy.optimize import minimize
 from tqdm import tqdm
 
-from dbdnet_jax.alignment.align import MAX_POINTS, align
+from dbdnet_jax.alignment.align import align
+from dbdnet_jax.alignment.arguments import MAX_POINTS
 from dbdnet_jax.alignment.candidates import Candidate, examine, far_starts, merged, near_starts
 from dbdnet_jax.alignment.consensus import agreed_poses, match_surfaces
-from dbdnet_jax.alignment.finding import Clues, find_clues, settle, with_incumbent
+from dbdnet_jax.alignment.finding import Clues, behind, find_clues, incumbent, settle
 from dbdnet_jax.alignment.normalised import as_given, normalise_pair
 from dbdnet_jax.alignment.search import NetworkPose
 from dbdnet_jax.alignment.success import (
@@ -79,7 +80,7 @@ def is_right(transform: Transform, pair: ScanPair) -> bool:
 
 def find(params: Params, pair: ScanPair, coefficients: Coefficients) -> Record:
     """The poses of a pair."""
-    scene = normalise_pair(pair.source, pair.target, "auto", MAX_POINTS, np.eye(4))
+    scene = normalise_pair(pair.source, pair.target, "auto", MAX_POINTS)
     source, target = scene.source.surface, scene.target.surface
     predicted, matched = find_clues(params, scene)
     lists = [
@@ -122,14 +123,15 @@ def judged(
     pair: ScanPair, record: Record, coefficients: Coefficients
 ) -> Iterator[tuple[PoseFeatures, bool, bool]]:
     """Features of the answer near the given orientation and everywhere, and whether it is right."""
-    scene = normalise_pair(pair.source, pair.target, "auto", MAX_POINTS, np.eye(4))
+    scene = normalise_pair(pair.source, pair.target, "auto", MAX_POINTS)
     overlaps = (np.array(x) for x in (record.source_overlap, record.target_overlap))
     nothing: Any = np.zeros((0, 0))
     predicted = NetworkPose(np.array(record.network), *overlaps, nothing, nothing, True)
     near, far = (candidates(x, coefficients.rank) for x in (record.near, record.far))
     every = merged(near, far, middle=scene.source.surface.points.mean(axis=0))
     sides = scene.source.surface, scene.target.surface
-    near, every = (with_incumbent(x, predicted, *sides, coefficients) for x in (near, every))
+    first = incumbent(predicted, *sides, coefficients)
+    near, every = (behind(first, x, sides[0]) for x in (near, every))
     clues = Clues(predicted, match_surfaces(*sides))
     for some, everywhere in ((near, False), (every, True)):
         found = settle(scene, some, clues, coefficients, None, everywhere=everywhere)

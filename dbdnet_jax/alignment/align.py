@@ -4,12 +4,14 @@ import dataclasses
 import itertools
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from dbdnet_jax.alignment import finding
+from dbdnet_jax.alignment.arguments import MAX_POINTS, check_options
 from dbdnet_jax.alignment.finding import Found
 from dbdnet_jax.alignment.mirrored import trust_beside_mirror
 from dbdnet_jax.alignment.normalised import (
@@ -26,14 +28,11 @@ from dbdnet_jax.io.forks import require_own_jax
 from dbdnet_jax.io.point_files import read_point_file
 from dbdnet_jax.io.programs import loading_seconds
 from dbdnet_jax.networks.params import Params
-from dbdnet_jax.networks.table import parts_of
-from dbdnet_jax.networks.weights import load_pretrained
-from dbdnet_jax.ops.transforms import as_transform
+from dbdnet_jax.networks.table import DEFAULT_METHOD, method_of, parts_of
+from dbdnet_jax.networks.weights import load_once
 from dbdnet_jax.types import Transform
 
-SEARCHES = ("auto", "near", "any")
 LISTED = 1.0  # alternatives whose score, a logarithm of odds, is lower by less are listed
-MAX_POINTS = 768  # the weights were trained on 717; a little more costs nothing
 
 
 class Matches(NamedTuple):
@@ -62,12 +61,15 @@ class Alignment:
 
     Where ``valid`` is False it is the best pose found, and ``reason`` says why not to trust it.
     ``source_overlap (n,)`` and ``target_overlap (m,)`` are probabilities of the points as given.
-    ``inlier_ratio`` is the part of the moved source that is within ``inlier_distance`` of the
-    target, ``rmse`` its distance. ``information`` (6, 6) is that of the point-to-plane residuals
-    for a small rotation (radians) about ``pivot`` and a small translation, in the target's frame;
-    its inverse, where it has one, is the covariance. ``alternatives`` are other poses that fit
-    about as well, best first: of a symmetric shape its symmetries. ``timings`` are seconds;
-    ``programs`` are loading and compiling, which no other counts.
+    ``success_probability`` is that of a pose right to 5 degrees and 5 % of the extent, fitted on
+    pairs whose pose is known; ``evidence`` is what it was made of. ``warnings`` are sentences that
+    hold of valid poses too. ``inlier_ratio`` is the part of the moved source that is within
+    ``inlier_distance`` of the target, ``rmse`` the root mean square of these points' distances.
+    ``matches`` are the network's own. ``information`` (6, 6) is that of the point-to-plane
+    residuals for a small rotation (radians) about ``pivot`` and a small translation, in the
+    target's frame; its inverse, where it has one, is the covariance. ``alternatives`` are other
+    poses that fit about as well, best first: of a symmetric shape its symmetries. ``timings`` are
+    seconds; ``programs`` are loading and compiling, which no other counts.
     """
 
     transform: Transform
@@ -106,12 +108,12 @@ class Alignment:
 def align(
     source: Any,
     target: Any,
-    params: Params | None = None,
+    params: Params | str | Path | None = None,
     *,
     refine: bool = True,
     search: str = "auto",
     scale: float | str = "auto",
-    overlap_threshold: float = 0.5,
+    overlap_threshold: float | None = None,
     max_points: int = MAX_POINTS,
     seed: int = 0,
     initial: Any = None,
@@ -122,14 +124,15 @@ def align(
     Args:
       source: (n, 3) numbers, n >= 16, or a file; see `point_files.read_point_file`.
       target: the same, (m, 3), in the same unit.
-      params: the network; the weights in the package, if None.
+      params: the network, or the name or ``.npz`` file of one; that of the package, if None.
       refine: refine poses; else the best of the network's and those given is the answer.
       search: "near" for poses near the given orientation (or ``initial``), "any" for all rotations,
         "auto" for these only where the former leave a doubt. Of poses that fit alike the one
         nearest to the given orientation is the answer.
       scale: factor from the clouds' unit to the weights'; "auto" brings the larger cloud to the
         size of a partial scan of a shape in the unit sphere.
-      overlap_threshold: probability above which a point enters the registration.
+      overlap_threshold: probability above which a point enters the registration; the network's
+        own, if None.
       max_points: of each cloud, for the network.
       seed: of the points drawn on a mesh; nothing else is random.
       initial: a guess of the transform (4, 4), left only where another pose fits clearly better.
@@ -141,22 +144,22 @@ def align(
       RuntimeError: the process was forked after JAX was used, and would hang; spawn it.
     """
     require_own_jax("align")
-    _check_arguments(search, scale, overlap_threshold, max_points)
-    guess = np.eye(4) if initial is None else _check_transform(initial)
-    proposed = [_check_transform(x, f"proposals[{i}]") for i, x in enumerate(proposals)]
+    guess, proposed = check_options(
+        refine, search, scale, overlap_threshold, max_points, initial, proposals
+    )
     laps, loaded = {"start": _clock()}, loading_seconds()
     source = read_point_file(source, "source", seed=seed)
     target = read_point_file(target, "target", seed=seed + 1)
     laps["read"] = _clock()
-    params = _with_threshold(params, overlap_threshold)
+    params = _network(params, overlap_threshold)
     coefficients = load_coefficients()
     laps["weights"] = _clock()
     scene = normalise_pair(source.points, target.points, scale, max_points, guess)
     laps["downsample"] = _clock()
-    given = None if initial is None else as_normalised(guess, scene)
-    others = [as_normalised(transform, scene) for transform in proposed]
+    guess = None if guess is None else as_normalised(guess, scene)
+    proposed = [as_normalised(transform, scene) for transform in proposed]
     found = finding.find_pose(
-        params, scene, coefficients, search, refine=refine, guess=given, proposals=others
+        params, scene, coefficients, search, refine=refine, guess=guess, proposals=proposed
     )
     laps["search"] = _clock()
     trust = _judge(scene, found, coefficients, refine)
@@ -164,11 +167,22 @@ def align(
     return _report(scene, found, trust, (*source.notes, *target.notes), laps, loaded)
 
 
-def _with_threshold(params: Params | None, overlap_threshold: float) -> Params:
-    """The network, or that of the package, with a threshold of its own."""
-    params = load_pretrained() if params is None else params
-    if params.registration is None or not set(parts_of(params.config)) <= params.networks.keys():
-        raise ValueError("params must hold both networks; one is None. Load a full set of weights.")
+def _network(params: Params | str | Path | None, overlap_threshold: float | None) -> Params:
+    """The network that is given, named or in the package, perhaps with another threshold."""
+    if not isinstance(params, Params):
+        params = load_once(str(params or "cad"))
+    if (method := method_of(params.config)) != DEFAULT_METHOD:
+        raise ValueError(
+            f"params must be weights of {DEFAULT_METHOD}; got those of {method}. Leave params out "
+            "for the weights in the package."
+        )
+    if not set(parts_of(params.config)) <= params.networks.keys():
+        raise ValueError(
+            f"params must hold both networks; got {', '.join(params.networks) or 'none'}. Load a "
+            "full set of weights."
+        )
+    if overlap_threshold is None:
+        return params
     config = dataclasses.replace(params.config, overlap_threshold=float(overlap_threshold))
     return dataclasses.replace(params, config=config)
 
@@ -252,36 +266,3 @@ def _matches(predicted: NetworkPose, scene: NormalisedPair) -> Matches:
         scene.target.downsampled.sparse[forth[rows]],
         predicted.mass[rows, forth[rows]],
     )
-
-
-def _check_arguments(
-    search: str, scale: float | str, overlap_threshold: float, max_points: int
-) -> None:
-    """Refuse words and numbers of no use."""
-    if search not in SEARCHES:
-        raise ValueError(f"search must be one of {', '.join(SEARCHES)}; got {search!r}.")
-    if scale != "auto" and not (isinstance(scale, int | float) and 0 < scale < np.inf):
-        raise ValueError(f"scale must be 'auto' or a positive number; got {scale!r}.")
-    if not 0 <= overlap_threshold < 1:
-        raise ValueError(f"overlap_threshold must be in [0, 1); got {overlap_threshold}. Use 0.5.")
-    if max_points < 64:
-        raise ValueError(f"max_points must be at least 64; got {max_points}. Use {MAX_POINTS}.")
-
-
-def _check_transform(values: Any, name: str = "initial") -> Transform:
-    """A 4x4 rigid transform, its rotation made exact, or a ValueError."""
-    try:
-        transform = np.asarray(values, np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be a 4x4 array of numbers: {error}.") from error
-    if transform.shape != (4, 4) or not np.isfinite(transform).all():
-        raise ValueError(f"{name} must be 4x4 and finite; got shape {transform.shape}.")
-    rotation = transform[:3, :3]
-    skew = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if skew > 1e-3 or np.linalg.det(rotation) < 0 or (transform[3] != [0, 0, 0, 1]).any():
-        raise ValueError(
-            f"{name} must be a rotation and a translation with a last row of 0 0 0 1; its rotation "
-            f"misses orthogonality by {skew:.2g}, with determinant {np.linalg.det(rotation):.3g}. "
-            "Remove scale and reflection."
-        )
-    return as_transform(rotation, transform[:3, 3])

@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 from collections.abc import Sequence
+from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -10,6 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from dbdnet_jax.alignment.align import Alignment, align
+from dbdnet_jax.alignment.arguments import MAX_POINTS, check_transform
+from dbdnet_jax.alignment.downsampling import downsample
 from dbdnet_jax.alignment.pose_graph import (
     Constraint,
     Poses,
@@ -19,9 +22,8 @@ from dbdnet_jax.alignment.pose_graph import (
     optimise,
 )
 from dbdnet_jax.errors import load_open3d
-from dbdnet_jax.io.point_files import read_points
+from dbdnet_jax.io.point_files import read_point_file
 from dbdnet_jax.networks.params import Params
-from dbdnet_jax.networks.weights import load_pretrained
 from dbdnet_jax.ops.transforms import as_transform, move
 
 ALL_PAIRS = 12  # clouds of which all pairs are aligned unless others are asked for
@@ -67,7 +69,7 @@ class MultiAlignment:
 
 def align_many(
     clouds: Sequence[Any],
-    params: Params | None = None,
+    params: Params | str | Path | None = None,
     *,
     pairs: Sequence[tuple[int, int]] | None = None,
     neighbours: int | None = None,
@@ -87,7 +89,7 @@ def align_many(
 
     Args:
       clouds: two or more, each an (n, 3) array or a file as for `align`, in one unit.
-      params: the network; the weights in the package, if None.
+      params: the network, or the name or ``.npz`` file of one; that of the package, if None.
       pairs: (source, target) numbers of the clouds to align; all pairs, if None and the clouds
         are at most 12. Pairs that close loops let wrong alignments be found out.
       neighbours: of clouds in the order in which they were scanned, align each with so many that
@@ -95,7 +97,8 @@ def align_many(
         4,950. From 2 on there are loops.
       initial: rough ``reference_from_cloud`` (k, 4, 4); each pair's own guess follows from it.
       seed: of the points drawn on meshes; nothing else is random.
-      **options: ``refine``, ``scale``, ``overlap_threshold`` and ``max_points`` of every `align`.
+      **options: of every `align`: ``refine``, ``search``, ``scale``, ``overlap_threshold`` and
+        ``max_points``.
 
     Raises:
       ValueError: clouds, pairs or arguments of no use.
@@ -105,13 +108,12 @@ def align_many(
     open3d = load_open3d("align_many")
     chosen = _check_pairs(len(clouds), pairs, neighbours)
     guesses = None if initial is None else _check_initial(initial, len(clouds))
-    points = [read_points(cloud, f"clouds[{i}]", seed=seed + i) for i, cloud in enumerate(clouds)]
-    params = load_pretrained() if params is None else params
+    read = [read_point_file(x, f"clouds[{i}]", seed=seed + i) for i, x in enumerate(clouds)]
     alignments = {}
     for i, j in chosen:
         guess = None if guesses is None else np.linalg.inv(guesses[j]) @ guesses[i]
-        alignments[i, j] = align(points[i], points[j], params, initial=guess, **options)
-    return _agree(open3d, points, alignments)
+        alignments[i, j] = align(read[i], read[j], params, initial=guess, **options)
+    return _agree(open3d, [cloud.points for cloud in read], alignments)
 
 
 def _agree(
@@ -120,11 +122,10 @@ def _agree(
     alignments: dict[tuple[int, int], Alignment],
 ) -> MultiAlignment:
     """Consistent poses out of the alignments of pairs."""
-    # Distant or large coordinates would cost the optimiser its digits; medians forget outliers.
-    centres = [np.median(cloud, axis=0) for cloud in points]
-    pairs = zip(points, centres, strict=True)
-    sizes = [np.median(np.linalg.norm(cloud - centre, axis=1)) for cloud, centre in pairs]
-    unit = float(max(sizes))
+    # Distant or large coordinates would cost the optimiser its digits.
+    chosen = [downsample(cloud, MAX_POINTS) for cloud in points]
+    centres = [rows.centre for rows in chosen]
+    unit = max(rows.size for rows in chosen)
     constraints = {
         (i, j): _constraint(i, j, alignment, centres[i], centres[j], unit)
         for (i, j), alignment in alignments.items()
@@ -231,10 +232,9 @@ def _check_pairs(
 
 
 def _check_initial(initial: Any, count: int) -> Float[np.ndarray, "k 4 4"]:
-    guesses = np.asarray(initial, np.float64)
-    if guesses.shape != (count, 4, 4) or not np.isfinite(guesses).all():
+    if np.shape(initial) != (count, 4, 4):
         raise ValueError(
-            f"initial must hold a finite 4x4 pose for each of the {count} clouds; got shape "
-            f"{guesses.shape}. Stack one for each cloud, the identity where nothing is known."
+            f"initial must hold a 4x4 pose for each of the {count} clouds; got shape "
+            f"{np.shape(initial)}. Stack one for each cloud, the identity where nothing is known."
         )
-    return guesses
+    return np.stack([check_transform(x, f"initial[{i}]") for i, x in enumerate(initial)])

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from dbdnet_jax.alignment.align import Alignment, align
+from dbdnet_jax.alignment.arguments import check_options
 from dbdnet_jax.errors import Failure
 from dbdnet_jax.io.programs import keep_compiled_programs, require_device
 from dbdnet_jax.io.workers import available_cores, default_jobs, run_in_processes, run_through
 from dbdnet_jax.networks.params import Params
-from dbdnet_jax.networks.weights import load_named
+from dbdnet_jax.networks.weights import load_once
 
 IN_FLIGHT = 2  # pairs for each core of this machine, of an executor that is given
 
@@ -61,15 +62,16 @@ def align_pairs(
         None.
       in_flight: pairs that an executor has at most; twice the cores of this machine, if None. Give
         twice the workers of a larger one.
-      **options: ``refine``, ``search``, ``scale``, ``overlap_threshold``, ``max_points``, ``seed``
-        and ``initial`` of every `align`.
+      **options: those of every `align`: ``refine``, ``search``, ``scale``, ``overlap_threshold``,
+        ``max_points``, ``seed``, ``initial`` and ``proposals``.
 
     Raises:
       TypeError: an option that `align` does not have.
-      ValueError: numbers below 1, or both an executor and jobs.
+      ValueError: options of no use, numbers below 1, or both an executor and jobs.
       RuntimeError: no process of its own can start.
     """
     inspect.signature(align).bind(None, None, None, **options)
+    check_options(**{name: value for name, value in options.items() if name != "seed"})
     for name, value in (("jobs", jobs), ("in_flight", in_flight)):
         if value is not None and value < 1:
             raise ValueError(f"{name} must be at least 1; got {value}. Leave it out for a default.")
@@ -91,20 +93,6 @@ def _results(found: Iterator[tuple[int, Any]]) -> Iterator[PairResult]:
     for number, answer in found:
         failed = isinstance(answer, Failure)
         yield PairResult(number, None if failed else answer, answer if failed else None)
-
-
-def load_once(name: str) -> Params:
-    """Weights as `load_named` has them, read anew only where their file has changed."""
-    path = Path(name).absolute() if name.endswith(".npz") else None
-    if path is None or not path.exists():
-        return _load_stamped(name, None)
-    status = path.stat()
-    return _load_stamped(str(path), (status.st_mtime_ns, status.st_size, status.st_ino))
-
-
-@functools.lru_cache(maxsize=2)
-def _load_stamped(name: str, _: tuple[int, ...] | None) -> Params:
-    return load_named(name)
 
 
 def _prepare(weights: Params | str) -> None:

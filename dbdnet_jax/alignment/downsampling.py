@@ -29,7 +29,7 @@ class Downsampled(NamedTuple):
 
     ``even`` are places in these, farthest points first, to search poses on; ``sparse`` are the rows
     of the first of them, for the network. ``centre`` (3,) and ``size`` describe the
-    cloud without outliers, in its own unit.
+    cloud without outliers, in its own unit. ``copies`` are points that stand where another does.
     """
 
     dense: Rows
@@ -38,21 +38,26 @@ class Downsampled(NamedTuple):
     centre: Float[np.ndarray, "3"]
     size: float
     outliers: int
+    copies: int = 0  # left out, of a cloud that no grid thins
 
 
 def downsample(points: Points, sparse: int, dense: int = DENSE) -> Downsampled:
     """Choose rows: without outliers, a voxel grid down to ``dense``, farthest points down to few.
+
+    A point stands once: vertices that each face repeats tell nothing of the cloud's spacing.
 
     The choice does not depend on the order of the rows, but for the grid's step above `SAMPLE`
     points. Memory: about 100 bytes a point beside the points.
     """
     rows = np.flatnonzero(inlying(points))
     outliers = len(points) - len(rows)
-    middle = np.median(points[rows], axis=0)
+    copies = 0
     if len(rows) > dense:
-        rows = _grid(points, rows, middle, dense)
-    else:  # in an order of their own
-        rows = rows[np.lexsort(points[rows].T)]
+        rows = _grid(points, rows, np.median(points[rows], axis=0), dense)
+    else:
+        inlying_rows = len(rows)
+        rows = _different(points, rows)
+        copies = inlying_rows - len(rows)
     middle = points[rows].mean(axis=0)
     offsets = points[rows] - middle
     outermost = int((offsets**2).sum(axis=1).argmax())
@@ -60,7 +65,14 @@ def downsample(points: Points, sparse: int, dense: int = DENSE) -> Downsampled:
     chosen = rows[even[:sparse]]
     centre = points[chosen].mean(axis=0)
     size = np.quantile(np.linalg.norm(points[chosen] - centre, axis=1), 0.98)
-    return Downsampled(rows, even, chosen, centre, float(size), outliers)
+    return Downsampled(rows, even, chosen, centre, float(size), outliers, copies)
+
+
+def _different(points: Points, rows: Rows) -> Fewer:
+    """Rows of different points, in an order of their own."""
+    rows = rows[np.lexsort(points[rows].T)]
+    again = (np.diff(points[rows], axis=0) == 0).all(axis=1)
+    return rows[np.concatenate([[True], ~again])]
 
 
 def _grid(points: Points, rows: Rows, middle: np.ndarray, dense: int) -> Fewer:

@@ -68,6 +68,7 @@ class Found(NamedTuple):
     evidence: PoseFeatures
     probability: float
     everywhere: bool
+    refined: bool = True
 
     @property
     def predicted(self) -> NetworkPose:
@@ -90,27 +91,25 @@ def find_pose(
     Without ``refine`` the network's pose, the guess and the proposals are judged as they are.
     """
     source, target = scene.source.surface, scene.target.surface
-    middle = source.points.mean(axis=0)
     clues = find_clues(params, scene)
     predicted = clues.predicted
     given = proposals if guess is None else [guess, *proposals]
     if not refine:
         poses = rank([predicted.transform, *given], source, target, coefficients)
-        return settle(scene, poses, clues, coefficients, guess, everywhere=False, last=False)
+        return settle(scene, poses, clues, coefficients, guess, everywhere=False, refined=False)
+    first = [] if guess is not None else incumbent(predicted, source, target, coefficients)
     agreed = agreed_poses(clues.matched)
     if how == "near":
         agreed = [pose for pose in agreed if angle_between(pose, np.eye(4))[0] < NEAR_DEG]
     starts = near_starts(predicted.transform, source) + given
     near = examine(starts, source, target, coefficients, close=given + agreed)
-    if guess is None:
-        near = with_incumbent(near, predicted, source, target, coefficients)
+    near = behind(first, near, source)
     found = settle(scene, near, clues, coefficients, guess, everywhere=False)
     if how == "near" or (how == "auto" and found.probability >= CONFIDENT):
         return found
     far = examine(far_starts(source, target), source, target, coefficients)
-    every = merged(near, far, middle=middle)
-    if guess is None:
-        every = with_incumbent(every, predicted, source, target, coefficients)
+    every = merged(near, far, middle=source.points.mean(axis=0))
+    every = behind(first, every, source)
     return settle(scene, every, clues, coefficients, guess, everywhere=True)
 
 
@@ -125,19 +124,22 @@ def is_sparse(source: Surface, target: Surface) -> bool:
     return min(len(side.points) for side in (source, target)) < SPARSE
 
 
-def with_incumbent(
-    candidates: list[Candidate],
-    predicted: NetworkPose,
-    source: Surface,
-    target: Surface,
-    coefficients: Coefficients,
+def incumbent(
+    predicted: NetworkPose, source: Surface, target: Surface, coefficients: Coefficients
 ) -> list[Candidate]:
-    """The candidates, of sparse clouds behind the network's pose as soft matching refines it."""
+    """Of sparse clouds the network's pose as soft matching refines it; of others nothing."""
     if not is_sparse(source, target):
-        return candidates
+        return []
     clouds = even_points(source), even_points(target)
-    pose = search.refine_multistart(predicted.transform, *clouds)
-    first = rank([pose], source, target, coefficients)
+    return rank(
+        [search.refine_multistart(predicted.transform, *clouds)], source, target, coefficients
+    )
+
+
+def behind(first: list[Candidate], candidates: list[Candidate], source: Surface) -> list[Candidate]:
+    """The candidates behind the one that comes first, if any: those that are other poses."""
+    if not first:
+        return candidates
     return first + different(candidates, first[0], source.points.mean(axis=0))
 
 
@@ -162,16 +164,17 @@ def settle(
     guess: Transform | None,
     *,
     everywhere: bool,
-    last: bool = True,
+    refined: bool = True,
 ) -> Found:
     """Choose one of the candidates, refine it on all points, and say what speaks for it."""
     source, target = scene.source.surface, scene.target.surface
-    if last and guess is None and is_sparse(source, target):
+    if refined and guess is None and is_sparse(source, target):
         row = stay_or_leave(candidates, source, target)
     else:
         row = choose(candidates, guess, source.points.mean(axis=0))
-    chosen, others = candidates[row], candidates[:row] + candidates[row + 1 :]
-    final = last_refined(chosen, source, target, coefficients) if last else chosen
+    chosen = candidates[row]
+    others = sorted(candidates[:row] + candidates[row + 1 :], key=lambda x: -x.score)
+    final = last_refined(chosen, source, target, coefficients) if refined else chosen
     distance = inlier_distance(source, target)
     moved = move(final.pose, source.points)
     quality = assess_pose(moved, target, distance)
@@ -203,6 +206,7 @@ def settle(
         evidence,
         probability,
         everywhere,
+        refined,
     )
 
 

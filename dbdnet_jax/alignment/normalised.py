@@ -34,13 +34,18 @@ class NormalisedPair(NamedTuple):
 
 
 def normalise_pair(
-    source: Points, target: OtherPoints, scale: float | str, max_points: int, guess: Transform
+    source: Points,
+    target: OtherPoints,
+    scale: float | str,
+    max_points: int,
+    guess: Transform | None = None,
 ) -> NormalisedPair:
-    """Downsample, centre, turn and scale two clouds, in float64.
+    """Downsample, centre, turn (by the guess, if any) and scale two clouds, in float64.
 
     Raises:
       ValueError: a cloud whose points are at too few places, or a scale beyond float32.
     """
+    guess = np.eye(4) if guess is None else guess
     downsampled = downsample(source, max_points), downsample(target, max_points)
     for name, rows in zip(("source", "target"), downsampled, strict=True):
         if len(rows.sparse) < MIN_POINTS:
@@ -86,10 +91,12 @@ def as_given(pose: Transform, scene: NormalisedPair) -> Transform:
 
 
 def is_full_resolution(scene: NormalisedPair) -> bool:
-    """Whether a pose is judged on all points of both clouds, but for outliers."""
+    """Whether a pose is judged on all points of both clouds, but for outliers and copies."""
     sides = scene.source, scene.target
     return all(
-        len(side.surface.points) + side.downsampled.outliers == len(side.points) for side in sides
+        len(rows.dense) + rows.outliers + rows.copies == len(side.points)
+        for side in sides
+        for rows in [side.downsampled]
     )
 
 

@@ -49,6 +49,8 @@ def _doubt(found: Found, inliers: float) -> str:
         cause = "other poses fit as well"
     else:
         cause = f"{inliers:.0%} of the source comes close to the target"
+    if not found.refined:
+        return f"{words}: {cause}, of poses as they were given; refine=True may help"
     where = "all rotations" if found.everywhere else "only what is near the given orientation"
     cure = "" if found.everywhere else 'search="any" or '
     return f"{words}: {cause}, of {where}; {cure}a rough initial= may help"

@@ -81,7 +81,7 @@ def make_parser() -> argparse.ArgumentParser:
     add("--refine", action=argparse.BooleanOptionalAction, default=True, help="refine the pose")
     add("--initial", type=Path, metavar="T", help="a first guess of the transform")
     add("--scale", type=_scale, default="auto", help="factor to the weights' unit, or auto")
-    add("--overlap-threshold", type=_share, default=0.5, metavar="P", help="default 0.5")
+    add("--overlap-threshold", type=_share, metavar="P", help="default: the weights' own")
     add("--max-points", type=_points, default=768, metavar="N", help="for the network; default 768")
     add("--seed", type=_seed, default=0, help="of points drawn on a mesh; default 0")
     return parser

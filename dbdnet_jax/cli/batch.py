@@ -28,7 +28,10 @@ def run_batch(options: argparse.Namespace, settings: Settings, jobs: Sequence[Jo
     """Align every pair that is not done yet; the largest exit status of all."""
     results, done = None, {}
     if options.results is not None:
-        results = open_results(options.results, settings.options | {"params": settings.weights})
+        from dbdnet_jax.networks.weights import weights_digest
+
+        network = {"params": settings.weights, "params_sha256": weights_digest(settings.weights)}
+        results = open_results(options.results, settings.options | network)
         done = {job: valid for job in jobs if (valid := find_done(results, job)) is not None}
         if done:
             say(f"{len(done)} of {len(jobs)} pairs are done already", to_stderr=True)

@@ -37,8 +37,8 @@ def prepare(weights: str) -> None:
     Raises:
       ValueError, OSError: what is the matter with them.
     """
-    from dbdnet_jax.alignment.align_pairs import load_once
     from dbdnet_jax.io.programs import keep_compiled_programs, require_device
+    from dbdnet_jax.networks.weights import load_once
 
     keep_compiled_programs()
     require_device()
@@ -52,9 +52,9 @@ def align_files(settings: Settings, job: Job) -> Answer:
       Exception: as `align` and the readers of files.
     """
     from dbdnet_jax.alignment.align import align
-    from dbdnet_jax.alignment.align_pairs import load_once
     from dbdnet_jax.alignment.writing import as_json, ply_file, transform_file
     from dbdnet_jax.io.point_files import read_point_file
+    from dbdnet_jax.networks.weights import load_once
 
     params = load_once(settings.weights)
     seed = settings.options["seed"]

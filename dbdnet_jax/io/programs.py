@@ -1,5 +1,6 @@
 """Compiled and traced programs kept on disk: making them takes seconds, reading them back none."""
 
+import contextlib
 import functools
 import hashlib
 import json
@@ -139,14 +140,15 @@ def _drop_damaged(folder: Path) -> None:
     """
     noted, whole = _read_noted(folder / _NOTED), {}
     for path in folder.glob("*-cache"):
-        state = path.stat()
-        mark = [state.st_size, state.st_mtime_ns]
-        if noted.get(path.name) != mark:
-            data = path.read_bytes()
-            if data[:4] != _ZSTANDARD and not _is_deflated(data):
-                path.unlink(missing_ok=True)
-                continue
-        whole[path.name] = mark
+        with contextlib.suppress(FileNotFoundError):  # another process was faster
+            state = path.stat()
+            mark = [state.st_size, state.st_mtime_ns]
+            if noted.get(path.name) != mark:
+                data = path.read_bytes()
+                if data[:4] != _ZSTANDARD and not _is_deflated(data):
+                    path.unlink()
+                    continue
+            whole[path.name] = mark
     if whole != noted:
         write_atomic(folder / _NOTED, json.dumps(whole).encode())
 

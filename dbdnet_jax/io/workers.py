@@ -247,10 +247,12 @@ def _outcome(future: Future) -> Any:
     """What `_attempt` returned, or a `Failure` that says that it did not return."""
     try:
         return future.result()
-    except Exception as error:
+    except BrokenExecutor as error:
         return Failure(
             "crash", f"the process that worked on it died ({type(error).__name__}: {error})."
         )
+    except Exception as error:  # it could not be sent, or nothing takes it any more
+        return failure_of(error)
 
 
 _HELD: dict[str, Callable[[Any], Any]] = {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import io
 import json
@@ -153,6 +154,26 @@ def load_named(name: str) -> Params:
             "Train first, or give --params=cad."
         )
     return load_params(name)
+
+
+def load_once(name: str) -> Params:
+    """Weights as `load_named` has them, read anew only where their file has changed."""
+    path = Path(name).absolute() if name.endswith(".npz") else None
+    if path is None or not path.exists():
+        return _load_stamped(name, None)
+    status = path.stat()
+    return _load_stamped(str(path), (status.st_mtime_ns, status.st_size, status.st_ino))
+
+
+def weights_digest(name: str) -> str | None:
+    """The sha256 of the file that `load_named` reads; None where it is not on this machine."""
+    path = Path(name) if name.endswith(".npz") else PRETRAINED / f"{name}.npz"
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else None
+
+
+@functools.lru_cache(maxsize=2)
+def _load_stamped(name: str, _: tuple[int, ...] | None) -> Params:
+    return load_named(name)
 
 
 def _checksum(header: str, arrays: Mapping[str, np.ndarray]) -> str:

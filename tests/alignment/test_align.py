@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from dbdnet_jax.alignment.align import Alignment
+from dbdnet_jax import save_params
+from dbdnet_jax.alignment.align import Alignment, align
 from dbdnet_jax.alignment.downsampling import DENSE, UNIT_SIZE, downsample
 from dbdnet_jax.alignment.finding import LIKELY
 from dbdnet_jax.alignment.normalised import is_full_resolution, normalise_pair
@@ -21,8 +22,9 @@ from dbdnet_jax.alignment.success import (
     load_coefficients,
     success_probability,
 )
-from tests.aligning import motion, pair, rotation_error_deg, solid, tiny_align
+from tests.aligning import POINTS, motion, pair, rotation_error_deg, solid, tiny_align, tiny_params
 from tests.alignment.test_quality import cylinder
+from tests.networks.dbdnet.small import SMALL
 
 SOURCE, TARGET, TRUE = pair()
 SAME_DEG = 0.05  # of two runs on the same clouds, otherwise written: float32 inside
@@ -147,9 +149,25 @@ def test_the_threshold_becomes_the_networks(monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("dbdnet_jax.alignment.search.predict_pose", ask)
-    with pytest.raises(KeyboardInterrupt):
-        tiny_align(SOURCE, TARGET, overlap_threshold=0.25)
-    assert seen == [0.25]
+    config = dataclasses.replace(SMALL, overlap_threshold=0.4)
+    for options in ({"overlap_threshold": 0.25}, {}):
+        with pytest.raises(KeyboardInterrupt):
+            align(SOURCE, TARGET, tiny_params().replace(config=config), **options)
+    assert seen == [0.25, 0.4]
+
+
+def test_a_network_may_be_a_file(tmp_path):
+    save_params(tmp_path / "tiny.npz", tiny_params())
+    options = {"initial": TRUE, "max_points": POINTS, "refine": False}
+    named = align(SOURCE, TARGET, tmp_path / "tiny.npz", **options)
+    given = align(SOURCE, TARGET, tiny_params(), **options)
+    np.testing.assert_array_equal(named.transform, given.transform)
+
+
+def test_a_doubtful_pose_that_was_not_refined_is_told_to_be(monkeypatch):
+    monkeypatch.setattr("dbdnet_jax.alignment.finding.success_probability", lambda *_: 0.1)
+    reason = tiny_align(SOURCE, TARGET, initial=TRUE, refine=False).reason
+    assert "refine=True may help" in reason and "search=" not in reason
 
 
 def test_thinning_keeps_shape_and_forgets_density_and_strays():
@@ -166,19 +184,17 @@ def test_thinning_keeps_shape_and_forgets_density_and_strays():
 
 
 def test_auto_scale_brings_the_larger_cloud_to_the_weights_size():
-    scene = normalise_pair(40 * SOURCE, 40 * TARGET, "auto", 150, np.eye(4))
+    scene = normalise_pair(40 * SOURCE, 40 * TARGET, "auto", 150)
     norms = [np.linalg.norm(side.sparse, axis=1) for side in (scene.source, scene.target)]
     assert max(np.quantile(x, 0.98) for x in norms) == pytest.approx(UNIT_SIZE)
-    assert normalise_pair(SOURCE, TARGET, 2.5, 150, np.eye(4)).factor == 2.5
+    assert normalise_pair(SOURCE, TARGET, 2.5, 150).factor == 2.5
 
 
 def test_clouds_that_a_grid_has_thinned_are_not_asked_whether_points_coincide():
-    few, many = (
-        normalise_pair(c, c, "auto", 100, np.eye(4)) for c in (solid(500, 1), solid(11_000, 1))
-    )
+    few, many = (normalise_pair(c, c, "auto", 100) for c in (solid(500, 1), solid(11_000, 1)))
     assert is_full_resolution(few) and not is_full_resolution(many)
     stray = np.vstack([solid(500, 1), [[50.0, 0, 0]]])
-    assert is_full_resolution(normalise_pair(stray, stray, "auto", 100, np.eye(4)))
+    assert is_full_resolution(normalise_pair(stray, stray, "auto", 100))
 
 
 def test_a_symmetric_shape_is_refused_and_its_motion_named():

@@ -224,7 +224,7 @@ def test_neighbours_in_the_order_of_scans_are_few_pairs_with_loops(monkeypatch):
     asked = []
 
     def align(source, target, *_, **__):
-        asked.append((len(source), len(target)))
+        asked.append((len(source.points), len(target.points)))
         return aligned(np.eye(4))
 
     monkeypatch.setattr(module, "align", align)
@@ -258,3 +258,26 @@ def test_without_open3d_the_error_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)  # import raises ImportError
     with pytest.raises(ImportError, match=r"pip install \"dbdnet_jax\[baselines\]\".*libusb-1.0-0"):
         align_many(CLOUDS)
+
+
+def test_zeros_for_missing_points_are_no_unit(monkeypatch):
+    """An organised scan may hold more zeros than points of the thing."""
+    true = poses(2)
+    monkeypatch.setattr(module, "align", lambda *_, **__: aligned(between(true, 0, 1)))
+    clouds = [np.vstack([random_cloud(i, 200), np.zeros((260, 3))]) for i in range(2)]
+    found = align_many(clouds, tiny_params())
+    np.testing.assert_allclose(found.reference_from_cloud, true, atol=1e-5)
+
+
+def test_what_was_noted_in_reading_is_told_of_every_edge(tmp_path):
+    points = solid(200, 0)
+    rows = [" ".join(map(str, row)) for row in [*points, [np.nan] * 3]]
+    (tmp_path / "a.xyz").write_text("\n".join(rows))
+    options = {"max_points": POINTS, "refine": False}
+    found = align_many([tmp_path / "a.xyz", points], tiny_params(), **options)
+    assert "NaN" in found.edges[0].alignment.warnings[0]
+
+
+def test_a_guess_that_is_no_motion_is_refused():
+    with pytest.raises(ValueError, match=r"initial\[1\] must be a rotation and a translation"):
+        align_many([solid(99, 0)] * 2, tiny_params(), initial=[np.eye(4), 2 * np.eye(4)])

@@ -55,6 +55,8 @@ def test_an_executor_that_is_given_aligns_with_a_network_that_is_given(clouds):
     ("options", "error", "message"),
     [
         ({"serach": "near"}, TypeError, "serach"),
+        ({"search": "all"}, ValueError, "search must be one of auto, near, any; got 'all'"),
+        ({"initial": 3}, ValueError, "initial must be 4x4"),
         ({"jobs": 0}, ValueError, "jobs must be at least 1; got 0"),
         ({"in_flight": -1}, ValueError, "in_flight must be at least 1; got -1"),
         ({"jobs": 2, "executor": ThreadPoolExecutor()}, ValueError, "jobs must not be given"),

@@ -25,7 +25,7 @@ def turned_scene():
     """Two dense partial drawings, the source turned by 150 degrees, and the pose between them."""
     turn = Rotation.from_rotvec([150, 0, 0], degrees=True).as_matrix()
     source, target = solid(3000, 3), solid(3000, 4)
-    scene = normalise_pair(source[source[:, 0] < 0.4] @ turn, target, "auto", POINTS, np.eye(4))
+    scene = normalise_pair(source[source[:, 0] < 0.4] @ turn, target, "auto", POINTS)
     return scene, as_normalised(transform_of(turn, np.zeros(3)), scene)
 
 
@@ -72,3 +72,19 @@ def test_the_last_step_ends_on_all_points(monkeypatch):
     monkeypatch.setattr(finding, "refine_point_to_plane", keep)
     last_refined(rank([np.eye(4)], source, target, COEFFICIENTS)[0], source, target, COEFFICIENTS)
     assert used == [300, 3000]
+
+
+def test_the_others_are_best_first_whichever_is_chosen(monkeypatch):
+    points = solid(300, 3)
+    scene = normalise_pair(points, solid(300, 4), "auto", POINTS)
+    monkeypatch.setattr(finding, "stay_or_leave", lambda *_: 1)
+    turns = [Rotation.from_euler("x", 40 * i, degrees=True).as_matrix() for i in range(4)]
+    poses = [transform_of(turn, np.zeros(3)) for turn in turns]
+    sides = scene.source.surface, scene.target.surface
+    rows = [rank([pose], *sides, COEFFICIENTS)[0] for pose in poses]
+    scores = (-2.0, 1.0, 0.5, -1.0)
+    rows = [row._replace(score=score) for row, score in zip(rows, scores, strict=True)]
+    clues = finding.find_clues(tiny_params(), scene)
+    found = finding.settle(scene, rows, clues, COEFFICIENTS, None, everywhere=True)
+    assert [other.score for other in found.others] == [0.5, -1.0, -2.0]
+    assert found.margin == 0.5

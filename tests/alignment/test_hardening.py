@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from dbdnet_jax import save_params
+from dbdnet_jax.alignment.arguments import check_options
 from dbdnet_jax.alignment.search import predict_pose
 from dbdnet_jax.alignment.writing import write_ply
 from dbdnet_jax.cli import main
@@ -80,7 +81,8 @@ BAD_ARGUMENTS = {
     "threshold 2": ({"overlap_threshold": 2.0}, r"overlap_threshold must be in \[0, 1\); got 2"),
     "threshold nan": ({"overlap_threshold": np.nan}, r"overlap_threshold must be in"),
     "initial 3x3": ({"initial": np.eye(3)}, r"initial must be 4x4 and finite; got shape \(3, 3\)"),
-    "initial nan": ({"initial": np.full((4, 4), np.nan)}, r"initial must be 4x4 and finite"),
+    "initial nan": ({"initial": np.full((4, 4), np.nan)}, r"initial must be .*; it holds nan"),
+    "any unrefined": ({"search": "any", "refine": False}, r"search must be 'auto' or 'near' with"),
     "initial scaled": ({"initial": 2 * np.eye(4)}, r"misses orthogonality by 3.* Remove scale"),
     "initial mirrored": ({"initial": MIRROR}, r"determinant -1\. Remove scale and reflection"),
     "initial transposed": ({"initial": TRUE.T}, r"last row of 0 0 0 1"),
@@ -98,7 +100,7 @@ def test_a_bad_argument_is_refused(name):
 def test_too_few_points_for_the_network_are_refused():
     from dbdnet_jax.alignment.align import align
 
-    with pytest.raises(ValueError, match=r"max_points must be at least 64; got 8"):
+    with pytest.raises(ValueError, match=r"at least 64; got 8"):
         align(SOURCE, TARGET, tiny_params(), max_points=8)
 
 
@@ -106,7 +108,7 @@ def test_half_a_network_is_refused():
     from dbdnet_jax.alignment.align import align
 
     half = tiny_params().replace(networks={"registration": tiny_params().registration})
-    with pytest.raises(ValueError, match="params must hold both networks"):
+    with pytest.raises(ValueError, match="both networks; got registration"):
         align(SOURCE, TARGET, half)
 
 
@@ -252,3 +254,39 @@ def test_a_bad_command_is_status_2_and_one_line(tmp_path, monkeypatch, capsys, n
     assert status == UNUSABLE
     assert message in err and not out and "Traceback" not in err
     assert sorted(Path().rglob("*")) == before
+
+
+def test_points_that_stand_twice_change_nothing():
+    twice = [np.repeat(cloud, 2, axis=0) for cloud in (SOURCE, TARGET)]
+    once, again = tiny_align(SOURCE, TARGET, initial=TRUE), tiny_align(*twice, initial=TRUE)
+    np.testing.assert_array_equal(again.transform, once.transform)
+    assert again.inlier_distance == once.inlier_distance
+    assert again.evidence == once.evidence and again.warnings == once.warnings
+    np.testing.assert_array_equal(again.source_overlap, np.repeat(once.source_overlap, 2))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"scale": True}, "scale must be .* got True"),
+        ({"overlap_threshold": "0.5"}, "overlap_threshold must be .* got '0.5'"),
+        ({"max_points": 70.5}, "max_points must be a whole number .* got 70.5"),
+    ],
+)
+def test_what_is_no_number_is_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        check_options(**options)
+
+
+def test_numbers_of_numpy_are_numbers():
+    options = {"scale": np.float32(2), "overlap_threshold": np.float32(0.5)}
+    assert check_options(**options, max_points=np.int64(99), proposals=None) == (None, [])
+
+
+def test_weights_of_another_method_are_refused_by_its_name():
+    from dbdnet_jax.alignment.align import align
+    from dbdnet_jax.networks.masknet.network import MaskNetConfig
+
+    other = tiny_params().replace(networks={}, config=MaskNetConfig())
+    with pytest.raises(ValueError, match="params must be weights of dbdnet; got those of masknet"):
+        align(SOURCE, TARGET, other)

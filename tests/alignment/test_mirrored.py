@@ -54,7 +54,7 @@ def drawn(thing, flip: list[int], seed: int = 0, count: int = 1500) -> Normalise
         cloud[np.argsort(cloud @ side)[: count * 11 // 15]]
         for cloud, side in zip(clouds, (ABOVE, BELOW), strict=True)
     )
-    return normalise_pair(first * flip, second, "auto", POINTS, np.eye(4))
+    return normalise_pair(first * flip, second, "auto", POINTS)
 
 
 def evidence_at(scene: NormalisedPair, pose: Transform) -> float:

@@ -7,15 +7,20 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
+from dbdnet_jax import save_params
 from dbdnet_jax.cli import main
 from dbdnet_jax.cli.statuses import ALIGNED, FAILED, UNREAD, UNSURE, UNUSABLE
 from dbdnet_jax.io.workers import run_through
+from dbdnet_jax.networks.initial import init_params
+from tests.aligning import tiny_params
 from tests.cli.conftest import HTML, PNG, needs_report
 from tests.cli.stand_ins import prepare_nothing, stand_in
 from tests.dask_cluster import cluster
+from tests.networks.dbdnet.small import SMALL
 
 ALIGN = importlib.import_module("dbdnet_jax.alignment.align")  # not the function
 
@@ -140,6 +145,15 @@ def test_a_batch_goes_on_from_its_results(batch):
     assert status == UNSURE and not out and "3 of 3 pairs are done already" in err
     lines = Path("answers.jsonl").read_text().splitlines()
     assert [json.loads(line)["source"] for line in lines] == ["a1", "u2", "b3", "a1", "a3"]
+
+
+def test_results_of_weights_that_changed_in_place_are_refused(batch):
+    more = "--results", "answers.jsonl", "--params", "own.npz"
+    save_params("own.npz", tiny_params())
+    assert batch("a1", *more)[0] == ALIGNED
+    save_params("own.npz", init_params(jax.random.key(1), SMALL))  # trained on
+    status, _, err = batch("a1", *more)
+    assert status == UNUSABLE and "answers.jsonl have params_sha256" in err
 
 
 def test_results_of_other_options_and_other_files_are_refused(batch):

@@ -69,18 +69,18 @@ def test_the_moved_source_is_saved(run, tmp_path):
 
 
 def test_no_refinement_is_asked_for(run, monkeypatch):
-    def settle(*_, last, **__):
-        assert last is False
+    def settle(*_, refined, **__):
+        assert refined is False
         pytest.fail("judged")
 
     monkeypatch.setattr("dbdnet_jax.alignment.finding.settle", settle)
-    refined = []
+    examined = []
     monkeypatch.setattr(
-        "dbdnet_jax.alignment.finding.examine", lambda *_: refined.append(1) or pytest.fail()
+        "dbdnet_jax.alignment.finding.examine", lambda *_: examined.append(1) or pytest.fail()
     )
     with pytest.raises(pytest.fail.Exception, match="judged"):
         run("a.ply", "b.ply", "--no-refine")
-    assert not refined
+    assert not examined
 
 
 def test_a_traceback_is_shown_to_who_asks_for_it(run, monkeypatch):

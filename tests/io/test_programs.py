@@ -228,3 +228,10 @@ def test_a_platform_that_is_not_there_is_one_line():
     )
     assert done.returncode == 2 and done.stderr.count("\n") == 1
     assert "error: JAX_PLATFORMS must name platforms that this machine has; got" in done.stderr
+
+
+def test_an_entry_that_vanishes_is_no_fault(tmp_path):
+    (tmp_path / "a-cache").symlink_to(tmp_path / "gone")  # as if unlinked after the listing
+    (tmp_path / "b-cache").write_bytes(b"damaged")
+    programs._drop_damaged(tmp_path)
+    assert not (tmp_path / "b-cache").exists()

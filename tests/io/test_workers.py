@@ -242,3 +242,10 @@ def test_processes_that_would_share_an_accelerator_are_one(monkeypatch):
     assert default_jobs() == 1
     monkeypatch.setenv("JAX_PLATFORMS", "cpu")
     assert default_jobs() == len(os.sched_getaffinity(0))
+
+
+def test_what_cannot_be_submitted_is_no_crash():
+    executor = ThreadPoolExecutor(1)
+    executor.shutdown()
+    ((_, failure),) = run_through(executor, square, [1], 1)
+    assert failure.kind == "unexpected" and "after shutdown" in failure.message

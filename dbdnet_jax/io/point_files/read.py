@@ -40,7 +40,7 @@ def read_point_file(source: Any, name: str = "source", *, seed: int = 0) -> Poin
 
     Raises:
       ValueError: damaged or unknown file, or points that are not (n, 3), real and finite, with
-        n >= 16 and at least three different ones.
+        n >= 16 and not all the same.
       OSError: the file is missing, a folder, or not readable.
       MissingExtraError: LAS, LAZ or E57 without its library.
     """

@@ -93,8 +93,8 @@ def _require_networks(params: Params, src: jax.Array, tgt: jax.Array) -> None:
     """Refuse half a network, and clouds without neighbours."""
     if params.registration is None:
         raise ValueError(
-            "register needs a registration network; these params hold only the overlap network. "
-            "Use predict_overlap, or load a full checkpoint."
+            "register needs DBDNet's registration network; these params hold "
+            f"{', '.join(params.networks) or 'no network'}. Load a full set of its weights."
         )
     for name, cloud in (("src", src), ("tgt", tgt)):
         if cloud.shape[0] < 2:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from flax.traverse_util import flatten_dict
 
-from dbdnet_jax.alignment.align import _with_threshold
+from dbdnet_jax.alignment.align import _network
 from dbdnet_jax.evaluation.methods import learned_methods
 from dbdnet_jax.networks.dbdnet.config import ModelConfig
 from dbdnet_jax.networks.dbdnet.growing import with_local_geometry
@@ -149,7 +149,7 @@ def test_weights_survive_a_file_and_are_a_row_of_a_table(tmp_path, name):
     jax.tree.map(np.testing.assert_array_equal, loaded.networks, params.networks)
     rows = [row.name for row in learned_methods(loaded, "DBDNet", 0)]
     assert rows[:2] == ["DBDNet (untrained)", "DBDNet"]
-    assert _with_threshold(loaded, 0.4).config.overlap_threshold == 0.4  # `align` takes them
+    assert _network(loaded, 0.4).config.overlap_threshold == 0.4  # `align` takes them
 
 
 @pytest.mark.parametrize(("name", "predicted"), [("dgcnn", False), ("joint_overlap", True)])
