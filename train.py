@@ -29,6 +29,7 @@ from dbdnet_jax.training.config import parse_flags, read_config
 from dbdnet_jax.training.loop import fit
 from dbdnet_jax.training.preemption import Interrupted, Preempted, interrupt_on_signals
 from dbdnet_jax.training.run_folder import load_best
+from dbdnet_jax.training.start import describe_start
 from dbdnet_jax.training.table import STAGES
 from dbdnet_jax.training.task import RunConfig
 
@@ -77,6 +78,9 @@ def train(run_dir: Path) -> None:
     stages = stages_of(config, STAGE.value)
     most = max(stage.batch_size for stage in config.stages.values())
     launch.start(config.train.devices, most)
+    first = jax.process_index() == 0
+    if config.train.start and first:
+        print(describe_start(config))
     for stage in stages:
         stream = load_training_pairs(
             config.data,
@@ -87,7 +91,6 @@ def train(run_dir: Path) -> None:
         )
         fit(config, stage, run_dir, stream)
     params = load_best(run_dir)
-    first = jax.process_index() == 0
     if first:
         save_params(run_dir / "params.npz", params)
         print(f"The best weights are in {run_dir / 'params.npz'}.")
