@@ -126,7 +126,7 @@ def judged(
     scene = normalise_pair(pair.source, pair.target, "auto", MAX_POINTS)
     overlaps = (np.array(x) for x in (record.source_overlap, record.target_overlap))
     nothing: Any = np.zeros((0, 0))
-    predicted = NetworkPose(np.array(record.network), *overlaps, nothing, nothing, True)
+    predicted = NetworkPose(np.array(record.network), *overlaps, nothing)
     near, far = (candidates(x, coefficients.rank) for x in (record.near, record.far))
     every = merged(near, far, middle=scene.source.surface.points.mean(axis=0))
     sides = scene.source.surface, scene.target.surface

@@ -1,1 +1,1 @@
-"""What `align` is made of: reading, thinning, search, quality and verdict of two clouds."""
+"""What `align` is made of: reading, downsampling, search, quality and validity of two clouds."""

@@ -43,8 +43,6 @@ class NetworkPose(NamedTuple):
     source_overlap: Float[np.ndarray, " n"]
     target_overlap: Float[np.ndarray, " m"]
     mass: Float[np.ndarray, "n m"]  # mean of both branches
-    confidence: Float[np.ndarray, " n"]
-    valid: bool
 
 
 def predict_pose(params: Params, source: Points, target: OtherPoints) -> NetworkPose:
@@ -61,20 +59,16 @@ def predict_pose(params: Params, source: Points, target: OtherPoints) -> Network
             answer.src_overlap,
             answer.tgt_overlap,
             sum(branch.correspondence for branch in branches) / 2,
-            answer.confidence,
-            answer.valid,
         )
 
     answer = _run(repr(config), network, params.networks, *_pad(source, target))
-    rotation, translation, source_overlap, target_overlap, mass, confidence, valid = answer
+    rotation, translation, source_overlap, target_overlap, mass = answer
     n, m = len(source), len(target)
     return NetworkPose(
         as_transform(rotation, translation),
         source_overlap[:n],
         target_overlap[:m],
         mass[:n, :m],
-        confidence[:n],
-        bool(valid),
     )
 
 

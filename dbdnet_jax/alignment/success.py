@@ -15,6 +15,7 @@ from dbdnet_jax.networks.weights import PRETRAINED
 SUCCESS_FILE = PRETRAINED / "cad_success.json"
 SUCCESS_DEG = 5.0  # a pose is right when its rotation is off by less ...
 SUCCESS_PART = 0.05  # ... and the source's middle by less than this part of the target's extent
+PARTS = ("mean", "deviation", "weight")  # of a regression, for each feature
 
 
 class FitFeatures(NamedTuple):
@@ -117,6 +118,3 @@ def load_coefficients(path: Path = SUCCESS_FILE) -> Coefficients:
             f"{path} must hold the coefficients of the success probability; it does not "
             f"({type(error).__name__}: {error}). Run tools/fit_success.py, or reinstall."
         ) from error
-
-
-PARTS = ("mean", "deviation", "weight")

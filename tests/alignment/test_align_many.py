@@ -201,7 +201,7 @@ def test_nothing_joined_leaves_the_reference_alone(stand_in):
 def clueless(params, source, target) -> search.NetworkPose:
     """A network that knows nothing, and costs no compilation."""
     ones = np.ones(len(source)), np.ones(len(target))
-    return search.NetworkPose(np.eye(4), *ones, np.outer(*ones) / len(target), ones[0], True)
+    return search.NetworkPose(np.eye(4), *ones, np.outer(*ones) / len(target))
 
 
 def test_three_scans_of_a_shape_find_together(monkeypatch):

@@ -2,6 +2,7 @@
 
 import re
 
+from dbdnet_jax.io.point_files.check import MIN_POINTS
 from dbdnet_jax.io.point_files.columns import find_xyz
 from dbdnet_jax.io.point_files.lines import COMMENTS, cells
 from dbdnet_jax.io.point_files.numbers import parse
@@ -14,7 +15,6 @@ PROSE = set(
     """a an and are as at by column columns exported exporter follow follows for from here in is
     made now of on our per scanned the then these this to units was we were with written""".split()
 )
-FEWEST = 16  # points of a cloud
 
 # First words of files whose rows are no points, though there may be three numbers in them.
 NO_TABLES = {"ncols": "a raster of heights", "dsaa": "a raster of heights", "ply": "a PLY"}
@@ -32,7 +32,7 @@ def promised(head: list[str]) -> int:
     """The count in a head that is one whole number; others are comments, sizes, versions."""
     counts = [line.strip() for line in head if line.strip().isdecimal()]
     count = int(counts[0]) if len(counts) == 1 and len(counts[0]) < 16 else 0
-    return count if count >= FEWEST else 0  # below: a version, a number of the scan
+    return count if count >= MIN_POINTS else 0  # below: a version, a number of the scan
 
 
 def named_columns(

@@ -8,11 +8,10 @@ import numpy as np
 from jaxtyping import Float
 
 from dbdnet_jax.io.point_files.numbers import parse
-from dbdnet_jax.io.point_files.record import FileFault, PointFile
+from dbdnet_jax.io.point_files.record import AGAIN, FileFault, PointFile
 from dbdnet_jax.io.point_files.surface import sample, triangles
 from dbdnet_jax.io.point_files.text import find_encoding
 
-AGAIN = "Export it again."
 FACET = np.dtype([("normal", "<3f4"), ("corners", "<3f4", (3,)), ("attribute", "<u2")])
 
 

@@ -14,12 +14,10 @@ from jaxtyping import Float
 
 from dbdnet_jax.io.point_files.columns import find_xyz
 from dbdnet_jax.io.point_files.numbers import parse, table
-from dbdnet_jax.io.point_files.record import FileFault, PointFile, drop_unmeasured
+from dbdnet_jax.io.point_files.record import AGAIN, CHUNK, FileFault, PointFile, drop_unmeasured
 
 HEAD_BYTES = 65536
-CHUNK = 65536  # rows of text that are parsed at once
 LZF_GROWTH = 132  # no LZF instruction of two bytes or more gives more bytes for each of its own
-AGAIN = "Export it again."
 
 
 class Head(NamedTuple):

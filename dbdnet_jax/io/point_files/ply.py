@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Int
 
 from dbdnet_jax.io.point_files.columns import find_xyz
-from dbdnet_jax.io.point_files.ply_rows import AGAIN, Columns, Element, read_rows
-from dbdnet_jax.io.point_files.record import FileFault, PointFile
+from dbdnet_jax.io.point_files.ply_rows import Columns, Element, read_rows
+from dbdnet_jax.io.point_files.record import AGAIN, FileFault, PointFile
 from dbdnet_jax.io.point_files.surface import sample, triangles
 
 HEAD_BYTES = 1 << 20

@@ -8,10 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from dbdnet_jax.io.point_files.numbers import table
-from dbdnet_jax.io.point_files.record import FileFault
+from dbdnet_jax.io.point_files.record import AGAIN, CHUNK, FileFault
 
-AGAIN = "Export it again."
-CHUNK = 65536  # lines that are parsed at once
 ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
 _NAMES = ("char i1", "uchar u1", "short i2", "ushort u2", "int i4", "uint u4")
 _SIZED = ("int8 i1", "uint8 u1", "int16 i2", "uint16 u2", "int32 i4", "uint32 u4")

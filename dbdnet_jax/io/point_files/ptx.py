@@ -7,11 +7,9 @@ import numpy as np
 from jaxtyping import Float
 
 from dbdnet_jax.io.point_files.numbers import parse, table
-from dbdnet_jax.io.point_files.record import FileFault, PointFile, drop_unmeasured
+from dbdnet_jax.io.point_files.record import AGAIN, CHUNK, FileFault, PointFile, drop_unmeasured
 
 HEAD = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)  # numbers in the lines before a scan's rows
-CHUNK = 65536
-AGAIN = "Export it again."
 
 
 def is_ptx(lines: list[str]) -> bool:

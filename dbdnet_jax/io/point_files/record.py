@@ -5,6 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+AGAIN = "Export it again."  # the fix of what is cut short or garbled
+CHUNK = 65536  # lines of text that are parsed at once
+
 
 class PointFile(NamedTuple):
     """Points of a file, and what its user should know about how they were read."""

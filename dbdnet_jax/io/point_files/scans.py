@@ -8,9 +8,7 @@ from typing import BinaryIO
 import numpy as np
 
 from dbdnet_jax.errors import MissingExtraError
-from dbdnet_jax.io.point_files.record import FileFault, PointFile, drop_unmeasured
-
-AGAIN = "Export it again."
+from dbdnet_jax.io.point_files.record import AGAIN, FileFault, PointFile, drop_unmeasured
 
 
 def _load(library: str, kind: str) -> ModuleType:

@@ -14,11 +14,10 @@ from dbdnet_jax.io.point_files import ptx
 from dbdnet_jax.io.point_files.dialect import Dialect, find_dialect
 from dbdnet_jax.io.point_files.lines import cells, uncommented
 from dbdnet_jax.io.point_files.numbers import parse, table
-from dbdnet_jax.io.point_files.record import FileFault, PointFile, drop_unmeasured
+from dbdnet_jax.io.point_files.record import CHUNK, FileFault, PointFile, drop_unmeasured
 
 SAMPLE = 400  # lines that decide how the rest is read
 SAMPLE_BYTES = 1 << 20
-CHUNK = 65536  # lines that are parsed at once
 
 
 def read_text(file: BinaryIO, path: Path, seed: int) -> PointFile:
