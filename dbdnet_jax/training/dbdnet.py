@@ -213,11 +213,13 @@ def joint_turn(
     Returns both clouds' overlap, the matches, the registration, and the pair it is of.
     """
     params = Params(networks, model)
+    # One for each network: from the same key both would drop the same weights.
+    keys = (None, None) if dropout_key is None else tuple(jax.random.split(dropout_key))
     source, target, matched = predict_overlap_and_matches(
-        params, pair.source, pair.target, dropout_key, start
+        params, pair.source, pair.target, keys[0], start
     )
     moved = pair if start is None else transform_source(pair, start)
-    found = register_given_overlap(params, moved.source, moved.target, source, target, dropout_key)
+    found = register_given_overlap(params, moved.source, moved.target, source, target, keys[1])
     return (source, target), matched, found, moved
 
 

@@ -73,11 +73,15 @@ def focal_loss(
     """Mean over valid points of ``-(1 - p_t)^gamma log(p_t)``, p_t the true class's probability.
 
     Focal loss (Lin et al. 2017) with both classes weighted alike, as the authors' code does; the
-    paper's formula with its alpha = 1 would erase the negative class. Finite for p_t = 0.
+    paper's formula with its alpha = 1 would erase the negative class. Finite for p_t = 0; for
+    p_t = 1 loss and gradient are 0, whatever the gamma.
     """
     p_true = jnp.where(label, probability, 1 - probability)
     p_true = jnp.where(valid, p_true, 1.0)  # before the log: padding may hold anything
-    loss = (1 - p_true) ** gamma * -jnp.log(jnp.maximum(p_true, SMALLEST_PROBABILITY))
+    certain = p_true == 1
+    missing = jnp.where(certain, 1.0, 1 - p_true)  # 0^gamma has no derivative for gamma < 1, 0 too
+    weight = jnp.where(certain, 0.0, missing**gamma)
+    loss = weight * -jnp.log(jnp.maximum(p_true, SMALLEST_PROBABILITY))
     return jnp.sum(loss) / divisor(jnp.sum(valid), loss.dtype)
 
 

@@ -84,11 +84,13 @@ def test_focal_loss_is_the_mean_over_valid_points(precision, gamma):
     assert_close(loss, expected, precision.tolerance)
 
 
-def test_focal_loss_is_finite_at_certainty_and_zero_without_points():
+@pytest.mark.parametrize("gamma", [4.0, 1.0, 0.5, 0.0])  # 0 is the CAD configuration's
+def test_focal_loss_is_finite_at_certainty_and_zero_without_points(gamma):
     probability = jnp.asarray([0.0, 1.0, 0.0, 1.0])
     label = jnp.asarray([True, True, False, False])
-    value, gradient = jax.value_and_grad(focal_loss)(probability, label, jnp.ones(4, bool))
+    value, gradient = jax.value_and_grad(focal_loss)(probability, label, jnp.ones(4, bool), gamma)
     assert_finite((value, gradient))
+    assert not gradient[1:3].any()
     assert value > 1
     assert focal_loss(probability, label, jnp.zeros(4, bool)) == 0
 

@@ -40,16 +40,18 @@ def registration(motion: Rigid) -> Registration:
 @pytest.fixture
 def calls(monkeypatch):
     """The starts and models that both networks are asked with; they say that all overlaps."""
-    seen = {"start": [], "solves": []}
+    seen = {"start": [], "solves": [], "keys": []}
 
     def overlap(params, source, target, dropout_key=None, start=None):
         seen["start"].append(start)
+        seen["keys"].append(dropout_key)
         return jnp.ones(SIZE), jnp.ones(SIZE), None
 
     def register(
         params, source, target, source_overlap, target_overlap, dropout_key=None, solves=None
     ):
         seen["solves"].append(solves)
+        seen["keys"].append(dropout_key)
         return registration(shift(0.0, 1.0, 0.0))
 
     monkeypatch.setattr(dbdnet, "predict_overlap_and_matches", overlap)
@@ -125,3 +127,9 @@ def test_joint_turns_begin_at_joint_starts(pair, calls, monkeypatch, model, expe
     )
     assert calls["start"] == [begun if expected else None] and calls["solves"] == [None]
     assert_close(loss, sum(terms), FLOAT32)
+
+
+def test_the_networks_of_a_joint_turn_drop_weights_of_their_own(pair, calls):
+    dbdnet.joint_turn(ONE_PASS, {}, pair, None, jax.random.key(0))
+    overlap, registration = map(jax.random.key_data, calls["keys"])
+    assert (overlap != registration).any()
