@@ -11,10 +11,10 @@ import pytest
 
 from configs.peers import masknet_cad
 from dbdnet_jax.data.training_pairs import PairStream, pairs_of_shapes
+from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.evaluation.methods import Weights, learned_methods, make_methods
 from dbdnet_jax.evaluation.run import Evaluation, constant_overlap, evaluate_method
 from dbdnet_jax.evaluation.tables import render
-from dbdnet_jax.io.safe_pickle import CheckpointError
 from dbdnet_jax.networks.initial import init_params
 from dbdnet_jax.networks.masknet.network import predict
 from dbdnet_jax.networks.weights import load_params, save_params

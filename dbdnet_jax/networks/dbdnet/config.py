@@ -132,20 +132,12 @@ class ModelConfig:
                     f"{name} must be {whole!r} where released=True: the released network is the "
                     f"paper's whole one; got {value!r}. Set one of the two otherwise."
                 )
-        for name in ("overlap_points", "registration_points"):
-            points = getattr(self, name)
-            if points and self.released:
+        for name in ("overlap_points", "registration_points", "local_geometry"):
+            if getattr(self, name) and self.released:
                 raise ValueError(
-                    f"{name} must be 0 (all points) or positive, and 0 where released=True (the "
-                    f"released network has no such limit); got {points}, released="
-                    f"{self.released}. Use 0."
+                    f"{name} must be 0 where released=True: the released network is given all "
+                    f"points, by their coordinates alone; got {getattr(self, name)}. Use 0."
                 )
-        if not 0 <= self.local_geometry <= len(RADII) or (self.local_geometry and self.released):
-            raise ValueError(
-                f"local_geometry must be from 0 to {len(RADII)} radii, and 0 where released=True "
-                f"(the released network has no such input); got {self.local_geometry}, released="
-                f"{self.released}. Use 0."
-            )
         if self.overlap_matching and self.overlap != "prior":
             raise ValueError(
                 "overlap_matching must be False unless overlap='prior': it is a part of the "

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from dbdnet_jax.io.safe_pickle import CheckpointError
+from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.networks.params import Params, unflatten
 from dbdnet_jax.networks.rienet.confidence import BRANCH, HEAD, TAPS
 from dbdnet_jax.networks.rienet.network import RIENetConfig

@@ -70,8 +70,13 @@ def test_a_translation_moves_the_answer_only(x64):
     assert_close(moved.tgt_overlap, plain.tgt_overlap, ROOTS)
 
 
-@pytest.mark.parametrize("fields", [{"local_geometry": 6}, {"local_geometry": -1},
-                                    {"local_geometry": 2, "released": True}])  # fmt: skip
-def test_what_cannot_be_seen_is_refused(fields):
-    with pytest.raises(ValueError, match="local_geometry must be from 0 to 5"):
-        ModelConfig(**fields)
+@pytest.mark.parametrize("radii", [6, -1])
+def test_what_cannot_be_seen_is_refused(radii):
+    with pytest.raises(ValueError, match=f"local_geometry must be from 0 to 5; got {radii}"):
+        ModelConfig(local_geometry=radii)
+
+
+@pytest.mark.parametrize("name", ["local_geometry", "overlap_points", "registration_points"])
+def test_the_released_network_sees_all_points_and_nothing_else(name):
+    with pytest.raises(ValueError, match=f"{name} must be 0 where released=True.*got 2. Use 0"):
+        ModelConfig(released=True, **{name: 2})

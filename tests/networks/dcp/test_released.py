@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dbdnet_jax.io.safe_pickle import CheckpointError
+from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.networks.dcp.network import DCPConfig, predict, shapes
 from dbdnet_jax.networks.dcp.released import entries, from_released
 from dbdnet_jax.networks.torch_state import arrays_from_state

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from dbdnet_jax.io.safe_pickle import CheckpointError
+from dbdnet_jax.errors import CheckpointError
 from dbdnet_jax.networks.batch_norm import fold
 from dbdnet_jax.networks.rienet.network import RIENet, RIENetConfig, pose_of, shapes
 from dbdnet_jax.networks.rienet.released import entries, from_released
