@@ -19,9 +19,6 @@ DENSE = 10_000  # points that a pose is judged on; nothing is downsampled below
 EVEN = 1024  # farthest points that poses are searched and ranked on, the network's among them
 BLOCK = 1_000_000  # rows that a grid thins at once: bounds the memory
 SAMPLE = 200_000  # rows that decide a grid's step
-# The size of a partial scan of a shape in the unit sphere: the median of the larger one of a pair
-# under the paper's protocol, on the training shapes. Its logarithm varies by 0.12.
-UNIT_SIZE = 0.95
 
 
 class Downsampled(NamedTuple):

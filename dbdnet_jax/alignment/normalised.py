@@ -5,8 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dbdnet_jax.alignment.downsampling import UNIT_SIZE, Downsampled, downsample
+from dbdnet_jax.alignment.downsampling import Downsampled, downsample
 from dbdnet_jax.alignment.surfaces import Surface, surface
+from dbdnet_jax.data.pairs import UNIT_SIZE
 from dbdnet_jax.io.point_files import MIN_POINTS
 from dbdnet_jax.ops.transforms import as_transform, move
 from dbdnet_jax.types import OtherPoints, Points, Transform

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from dbdnet_jax.data.pairs import Protocol
+from dbdnet_jax.data.pairs import UNIT_SIZE, Protocol
 from dbdnet_jax.data.scans import Seen, centred_cloud, cut, noisy, sample, shared, view
 from dbdnet_jax.data.worlds import OTHERS, Surface, World, draw_world
 from dbdnet_jax.ops import rigid
@@ -23,7 +23,6 @@ LEAST_SHARED = 0.15  # of the smaller view, by area: 0.2 and more of the points,
 TRIES = 4  # second views, of which the one is taken that shares what was drawn most nearly
 NEAREST = 5  # points, of which one is the near one of a stock
 MOST_NOISE = 2.0  # times the protocol's
-UNIT_SIZE = 0.95  # `alignment.downsampling.UNIT_SIZE`: what align makes of the larger cloud
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from dbdnet_jax import save_params
 from dbdnet_jax.alignment.align import Alignment, align
-from dbdnet_jax.alignment.downsampling import DENSE, UNIT_SIZE, downsample
+from dbdnet_jax.alignment.downsampling import DENSE, downsample
 from dbdnet_jax.alignment.finding import LIKELY
 from dbdnet_jax.alignment.normalised import is_full_resolution, normalise_pair
 from dbdnet_jax.alignment.success import (
@@ -22,6 +22,7 @@ from dbdnet_jax.alignment.success import (
     load_coefficients,
     success_probability,
 )
+from dbdnet_jax.data.pairs import UNIT_SIZE
 from tests.aligning import POINTS, motion, pair, rotation_error_deg, solid, tiny_align, tiny_params
 from tests.alignment.test_quality import cylinder
 from tests.networks.dbdnet.small import SMALL

@@ -6,19 +6,17 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from dbdnet_jax.alignment import downsampling
 from dbdnet_jax.data import scans
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.mixture import (
     PARTS,
-    UNIT_SIZE,
     Mixture,
     any_rotation,
     make_mixture_pair,
     make_part_pair,
     stock_of,
 )
-from dbdnet_jax.data.pairs import Protocol
+from dbdnet_jax.data.pairs import UNIT_SIZE, Protocol
 from dbdnet_jax.data.worlds import Surface, World, draw_world
 
 PROTOCOL = Protocol(points=512)
@@ -56,7 +54,6 @@ def valid_points(pair):
 
 def test_parts_are_the_mixtures():
     assert set(PARTS) == set(Mixture.__dataclass_fields__)
-    assert UNIT_SIZE == downsampling.UNIT_SIZE
 
 
 @pytest.mark.parametrize("name", PARTS)
