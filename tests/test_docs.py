@@ -87,6 +87,12 @@ def test_commands_name_scripts_flags_and_files_that_exist(page):
     assert [(x, wrong) for x in commands(page) if (wrong := wrong_words(x))] == []
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_files_of_tests_that_a_page_names_exist(page):
+    named = set(re.findall(r"\btests/[\w/]+\.\w+", page.read_text()))
+    assert [x for x in named if "NAME" not in x and not (ROOT / x).is_file()] == []
+
+
 @pytest.mark.parametrize(
     ("command", "wrong"),
     [
