@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from dbdnet_jax.data.pairs import PairDraw, Protocol, assemble
 from dbdnet_jax.ops import rigid
+from dbdnet_jax.ops.quaternion import any_rotation
 from dbdnet_jax.ops.sampling import ball_crop, half_space_crop, random_direction
 from dbdnet_jax.types import Pair
 
@@ -61,6 +62,20 @@ def make_augmented_pair(
     noise = jnp.clip(noise, -protocol.noise_clip, protocol.noise_clip)
     draw = PairDraw(source, target, motion, noise[0], noise[1])
     return assemble(draw, points, normals, protocol.overlap_radius)
+
+
+def stretched(key: PRNGKeyArray, points: Float[Array, "s 3"], most: float) -> Float[Array, "s 3"]:
+    """The shape stretched along three perpendicular axes of any direction, and in the unit sphere.
+
+    Each factor lies between 1 / ``most`` and ``most``; 1 leaves the shape as it is.
+    """
+    axes_key, factor_key = jax.random.split(key)
+    axes = any_rotation(axes_key)
+    factors = most ** jax.random.uniform(factor_key, (3,), minval=-1.0)
+    stretch = jnp.matmul(axes * factors[None, :], axes.T, precision=rigid.HIGHEST)
+    points = jnp.matmul(points, stretch, precision=rigid.HIGHEST)
+    points -= points.mean(axis=0, keepdims=True)
+    return points / jnp.linalg.norm(points, axis=1).max()
 
 
 def require_enough_points(total: int, protocol: Protocol) -> None:

@@ -17,6 +17,7 @@ class DataConfig:
     folder: str = ""
     categories: str = "all"  # "all", or one half of the shape classes: "seen" or "unseen"
     procedural: int = 0  # generated shapes to train on beside those of "cad": 15 ms each
+    stretch: float = 1.0  # most by which training shapes are stretched along axes of any direction
     augment: float = 0.0  # share of the training pairs under other conditions than the protocol's
     mixture: Mixture = Mixture()  # shares of pairs as the world is; ``augment`` is of the others
 
@@ -42,6 +43,11 @@ class DataConfig:
             raise ValueError(
                 "config.data.procedural must not be negative, and 0 for other data than 'cad'; got "
                 f"{self.procedural} for {self.name!r}. Use 0."
+            )
+        if not 1 <= self.stretch <= 4 or (self.stretch > 1 and self.name == "threedmatch"):
+            raise ValueError(
+                "config.data.stretch must be in [1, 4], and 1 for 'threedmatch', whose pairs are "
+                f"read; got {self.stretch} for {self.name!r}. Use 1."
             )
         if not 0 <= self.augment <= 1 or (self.augment and self.name == "threedmatch"):
             raise ValueError(

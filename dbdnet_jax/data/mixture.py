@@ -16,7 +16,7 @@ from dbdnet_jax.data.scans import Seen, centred_cloud, cut, noisy, sample, share
 from dbdnet_jax.data.worlds import OTHERS, Surface, World, draw_world
 from dbdnet_jax.ops import rigid
 from dbdnet_jax.ops.grouping import squared_distances
-from dbdnet_jax.ops.quaternion import rotation_from_quaternion
+from dbdnet_jax.ops.quaternion import any_rotation
 from dbdnet_jax.types import Cloud, Pair, Rigid
 
 LEAST_SHARED = 0.15  # of the smaller view, by area: 0.2 and more of the points, mostly
@@ -190,12 +190,6 @@ def _motion(key: PRNGKeyArray, protocol: Protocol, turned: Bool[Array, ""]) -> R
     )
     rotation = jnp.where(turned, any_rotation(turn_key), motion.rotation)
     return Rigid(rotation, motion.translation)
-
-
-def any_rotation(key: PRNGKeyArray) -> Float[Array, "3 3"]:
-    """A rotation, uniform over all: that of a random unit quaternion (Shoemake 1992)."""
-    quaternion = jax.random.normal(key, (4,))
-    return rotation_from_quaternion(quaternion / jnp.linalg.norm(quaternion))
 
 
 def _pair(

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from dbdnet_jax.data.augment import make_augmented_pair, require_enough_points
+from dbdnet_jax.data.augment import make_augmented_pair, require_enough_points, stretched
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.config import DataConfig
 from dbdnet_jax.data.mixture import Mixture, Stock, make_mixture_pair, stock_of
@@ -67,6 +67,7 @@ def load_training_pairs(
         protocol,
         seed=seed,
         validation_pairs=validation_pairs,
+        stretch=data.stretch,
         augment=data.augment,
         mixture=data.mixture,
     )
@@ -95,13 +96,15 @@ def pairs_of_shapes(
     *,
     seed: int,
     validation_pairs: int,
+    stretch: float = 1.0,
     augment: float = 0.0,
     mixture: Mixture | None = None,
 ) -> PairStream:
     """Pairs drawn on the device; every epoch sees every shape once, in an order of its own.
 
-    The parts of ``mixture`` have their shares of the training pairs (`make_mixture_pair`); of the
-    others a share of ``augment`` is drawn by `make_augmented_pair`.
+    The parts of ``mixture`` have their shares of the training pairs (`make_mixture_pair`); the
+    others are of shapes stretched by up to ``stretch`` (`stretched`), and a share of ``augment`` of
+    them is drawn by `make_augmented_pair`.
 
     Raises:
         ValueError: no shape to train or to validate on, or shapes of too few points.
@@ -126,26 +129,37 @@ def pairs_of_shapes(
             return jax.lax.cond(
                 jax.random.uniform(mixed_key) < mixed,
                 lambda: make_mixture_pair(key, row, arrays, mixture, protocol),
-                lambda: draw_of(key, arrays.points[row]),
+                lambda: _pair_of(key, arrays.points[row], protocol, stretch, augment),
             )
-        return draw_of(key, arrays[row])
-
-    def draw_of(key: PRNGKeyArray, shape: Array) -> Pair:
-        normals = jnp.zeros_like(shape)  # nothing trains on them
-        if not augment:
-            return make_pair(key, shape, normals, protocol)
-        choice_key, key = jax.random.split(key)
-        return jax.lax.cond(
-            jax.random.uniform(choice_key) < augment,
-            lambda: make_augmented_pair(key, shape, normals, protocol),
-            lambda: make_pair(key, shape, normals, protocol),
-        )
+        return _pair_of(key, arrays[row], protocol, stretch, augment)
 
     return PairStream(
         epoch_pairs=count,
         arrays=lambda start: itertools.repeat(held),
         draw=draw,
         validation=_fixed_pairs(validation, protocol, validation_pairs),
+    )
+
+
+def _pair_of(
+    key: PRNGKeyArray,
+    shape: Float[Array, "s 3"],
+    protocol: Protocol,
+    stretch: float,
+    augment: float,
+) -> Pair:
+    """A pair of a shape, perhaps stretched, perhaps drawn more widely than the protocol says."""
+    if stretch > 1:
+        stretch_key, key = jax.random.split(key)
+        shape = stretched(stretch_key, shape, stretch)
+    normals = jnp.zeros_like(shape)  # nothing trains on them
+    if not augment:
+        return make_pair(key, shape, normals, protocol)
+    choice_key, key = jax.random.split(key)
+    return jax.lax.cond(
+        jax.random.uniform(choice_key) < augment,
+        lambda: make_augmented_pair(key, shape, normals, protocol),
+        lambda: make_pair(key, shape, normals, protocol),
     )
 
 

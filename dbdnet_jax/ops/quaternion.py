@@ -1,7 +1,8 @@
 """Unit quaternions (w, x, y, z): rotation matrices from them and to them, and their product."""
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PRNGKeyArray
 
 
 def rotation_from_quaternion(q: Float[Array, "*stack 4"]) -> Float[Array, "*stack 3 3"]:
@@ -54,3 +55,9 @@ def multiply(
         ],
         axis=-1,
     )
+
+
+def any_rotation(key: PRNGKeyArray) -> Float[Array, "3 3"]:
+    """A rotation, uniform over all: that of a random unit quaternion (Shoemake 1992)."""
+    quaternion = jax.random.normal(key, (4,))
+    return rotation_from_quaternion(quaternion / jnp.linalg.norm(quaternion))

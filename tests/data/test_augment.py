@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from dbdnet_jax.data import augment
-from dbdnet_jax.data.augment import make_augmented_pair
+from dbdnet_jax.data.augment import make_augmented_pair, stretched
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.pairs import Protocol
 
@@ -115,3 +115,21 @@ def test_a_shape_of_too_few_points_is_refused():
     points = jnp.zeros((600, 3))
     with pytest.raises(ValueError, match="at least 716; got 600. Lower config.protocol.points"):
         make_augmented_pair(jax.random.key(0), points, points, PROTOCOL)
+
+
+def test_a_stretched_shape_is_one_map_of_the_shape(shape):
+    points = jnp.asarray(shape)
+    found = jax.vmap(lambda key: stretched(key, points, 1.5))(
+        jax.random.split(jax.random.key(1), 50)
+    )
+    np.testing.assert_allclose(jnp.linalg.norm(found, axis=-1).max(axis=1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(found.mean(axis=1), 0.0, atol=1e-5)
+    centred = np.asarray(shape - shape.mean(axis=0), np.float64)
+    ratios = []
+    for moved in np.asarray(found, np.float64):
+        linear, residual, *_ = np.linalg.lstsq(centred, moved, rcond=None)
+        assert residual.max() < 1e-6
+        factors = np.linalg.svd(linear, compute_uv=False)
+        ratios.append(factors[0] / factors[-1])
+        assert np.abs(linear - linear.T).max() < 1e-4  # stretched, and not turned
+    assert 1.0 < min(ratios) and 1.5 < max(ratios) <= 1.5**2

@@ -10,6 +10,8 @@ from dbdnet_jax.data.config import DataConfig
     [
         ({"categories": "Seen"}, "categories must be one of .*'unseen'.*; got 'Seen'"),
         ({"name": "threedmatch", "categories": "seen"}, "categories must be 'all' for 'three"),
+        ({"stretch": 0.5}, r"stretch must be in \[1, 4\].*; got 0.5"),
+        ({"name": "threedmatch", "stretch": 1.2}, "stretch must be .* 1 for 'threedmatch'"),
         ({"folder": "shapes"}, "folder must be '' for 'cad'.*; got 'shapes'. Leave it out"),
     ],
 )

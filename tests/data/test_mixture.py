@@ -11,7 +11,6 @@ from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.data.mixture import (
     PARTS,
     Mixture,
-    any_rotation,
     make_mixture_pair,
     make_part_pair,
     stock_of,
@@ -90,14 +89,6 @@ def test_turned_pairs_alone_turn_farther_than_the_protocol(drawn):
     for name, traces in angles.items():
         # Three Euler angles of 45 degrees make 86 degrees at most.
         assert (min(traces) < 1 + 2 * np.cos(np.deg2rad(90))) == (name == "turned")
-
-
-def test_any_rotation_is_one():
-    turn = jax.vmap(any_rotation)(jax.random.split(jax.random.key(0), 400))
-    unit = jnp.einsum("nij,nkj->nik", turn, turn)
-    np.testing.assert_allclose(unit, np.tile(np.eye(3), (400, 1, 1)), atol=1e-5)
-    np.testing.assert_allclose(jnp.linalg.det(turn), 1.0, atol=1e-5)
-    np.testing.assert_allclose(turn.mean(axis=0), 0.0, atol=0.1)  # uniform
 
 
 def test_a_camera_does_not_see_what_is_hidden():

@@ -58,8 +58,9 @@ def test_a_share_of_the_pairs_is_drawn_more_widely():
     clean = dataclasses.replace(stand_in.PROTOCOL, noise_sigma=0.0)
     key, points = jax.random.key(0), jnp.asarray(shapes.points)
 
-    def radii(augment):
-        pairs = pairs_of_shapes(shapes, shapes, clean, seed=0, validation_pairs=1, augment=augment)
+    def radii(augment, stretch=1.0):
+        options = {"seed": 0, "validation_pairs": 1, "augment": augment, "stretch": stretch}
+        pairs = pairs_of_shapes(shapes, shapes, clean, **options)
         draw = jax.jit(lambda n: pairs.draw(jax.random.fold_in(key, n), n, points).target.points)
         on_shape = cKDTree(points.reshape(-1, 3)).query
         return np.array([on_shape(draw(jnp.asarray(n)))[0].max() for n in range(60)])
@@ -67,6 +68,7 @@ def test_a_share_of_the_pairs_is_drawn_more_widely():
     assert radii(0.0).max() < 1e-5
     assert 0.15 < (radii(0.3) > 1e-3).mean() < 0.45  # another scale: no longer on the shape
     assert (radii(1.0) > 1e-3).mean() > 0.9
+    assert (radii(0.0, stretch=1.5) > 1e-3).mean() > 0.9
 
 
 def test_shapes_too_small_to_draw_widely_are_refused_before_anything_starts():

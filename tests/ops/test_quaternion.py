@@ -1,5 +1,6 @@
 """Quaternions against SciPy's."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -32,3 +33,11 @@ def test_a_product_is_one_rotation_after_the_other():
     )
     product = quaternion.rotation_from_quaternion(quaternion.multiply(p, q))
     assert_close(product, (second * first).as_matrix(), FLOAT64)
+
+
+def test_any_rotation_is_one():
+    turn = jax.vmap(quaternion.any_rotation)(jax.random.split(jax.random.key(0), 400))
+    unit = jnp.einsum("nij,nkj->nik", turn, turn)
+    np.testing.assert_allclose(unit, np.tile(np.eye(3), (400, 1, 1)), atol=1e-5)
+    np.testing.assert_allclose(jnp.linalg.det(turn), 1.0, atol=1e-5)
+    np.testing.assert_allclose(turn.mean(axis=0), 0.0, atol=0.1)  # uniform

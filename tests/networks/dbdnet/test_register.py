@@ -198,7 +198,7 @@ def test_the_answer_has_the_type_of_the_clouds(dtype, x64):
 
 def test_overlap_parameters_alone_do_not_register(x64):
     alone = overlap_alone(small_params())
-    with pytest.raises(ValueError, match="needs a registration network.*predict_overlap"):
+    with pytest.raises(ValueError, match="these params hold overlap. Load a full set"):
         register(alone, jnp.asarray(SOURCE), jnp.asarray(TARGET))
 
 
