@@ -3,10 +3,10 @@
     python train.py --config=configs/cad.py
 
 50 + 50 epochs of 642 shapes, 32,100 pairs for each network at about 55 ms of one core
-(`benchmarks.step`): three quarters of an hour on two cores. The weights in the package come of
-shorter runs, one after the other; docs/training.md has their commands and curves. From fresh
-weights this schedule has not been run to its end. Then `--stage=joint` trains both together, 8
-epochs at two to three times that a pair.
+(`benchmarks.step`): three quarters of an hour on two cores. The weights in the package were
+trained longer and on more kinds of pairs (configs/cad_long.py). From fresh weights this schedule
+has not been run to its end. Then `--stage=joint` trains both together, 8 epochs at two to three
+times that a pair.
 """
 
 from ml_collections import ConfigDict
