@@ -65,7 +65,7 @@ def make_augmented_pair(
 
 
 def stretched(key: PRNGKeyArray, points: Float[Array, "s 3"], most: float) -> Float[Array, "s 3"]:
-    """The shape stretched along three perpendicular axes of any direction, and in the unit sphere.
+    """A centred shape stretched along three axes at right angles, of any direction, to radius 1.
 
     Each factor lies between 1 / ``most`` and ``most``; 1 leaves the shape as it is.
     """
@@ -74,7 +74,6 @@ def stretched(key: PRNGKeyArray, points: Float[Array, "s 3"], most: float) -> Fl
     factors = most ** jax.random.uniform(factor_key, (3,), minval=-1.0)
     stretch = jnp.matmul(axes * factors[None, :], axes.T, precision=rigid.HIGHEST)
     points = jnp.matmul(points, stretch, precision=rigid.HIGHEST)
-    points -= points.mean(axis=0, keepdims=True)
     return points / jnp.linalg.norm(points, axis=1).max()
 
 
