@@ -39,7 +39,7 @@ def child(way: str) -> None:
     package = lap("package", lambda: __import__("dbdnet_jax"))
     import numpy as np
 
-    from dbdnet_jax.alignment.search import predict_pose
+    from dbdnet_jax.alignment.pose_programs import predict_pose
     from dbdnet_jax.io.programs import keep_compiled_programs
 
     keep_compiled_programs()

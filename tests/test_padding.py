@@ -48,7 +48,7 @@ EXEMPT = {
     "predict_given_overlap": "register_given_overlap",
     "geometry_of": "part of register_clouds",
     "iterate": "part of register_clouds",
-    "refine_each": "compared in tests/alignment/test_search.py, start by start",
+    "refine_each": "compared in tests/alignment/test_pose_programs.py, start by start",
     "overlap_loss_of": "overlap_loss of predict_overlap_and_matches",
     "registration_loss_of": "registration_loss of register_given_overlap",
     "joint_turn": "predict_overlap_and_matches and register_given_overlap",

@@ -24,9 +24,9 @@ from dbdnet_jax.alignment.align import align
 from dbdnet_jax.alignment.arguments import MAX_POINTS
 from dbdnet_jax.alignment.candidates import Candidate, examine, far_starts, merged, near_starts
 from dbdnet_jax.alignment.consensus import agreed_poses, match_surfaces
-from dbdnet_jax.alignment.finding import Clues, behind, find_clues, incumbent, settle
 from dbdnet_jax.alignment.normalised import as_given, normalise_pair
-from dbdnet_jax.alignment.search import NetworkPose
+from dbdnet_jax.alignment.pose_programs import NetworkPose
+from dbdnet_jax.alignment.search import Clues, behind, find_clues, incumbent, settle
 from dbdnet_jax.alignment.success import (
     SUCCESS_DEG,
     SUCCESS_FILE,

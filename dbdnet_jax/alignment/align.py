@@ -10,9 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from dbdnet_jax.alignment import finding
 from dbdnet_jax.alignment.arguments import MAX_POINTS, check_options
-from dbdnet_jax.alignment.finding import Found
 from dbdnet_jax.alignment.mirrored import trust_beside_mirror
 from dbdnet_jax.alignment.normalised import (
     NormalisedCloud,
@@ -21,7 +19,8 @@ from dbdnet_jax.alignment.normalised import (
     as_normalised,
     normalise_pair,
 )
-from dbdnet_jax.alignment.search import NetworkPose
+from dbdnet_jax.alignment.pose_programs import NetworkPose
+from dbdnet_jax.alignment.search import Found, find_pose
 from dbdnet_jax.alignment.success import Coefficients, PoseFeatures, load_coefficients
 from dbdnet_jax.alignment.validity import Trust, rejection_reason, warnings
 from dbdnet_jax.io.forks import require_own_jax
@@ -158,7 +157,7 @@ def align(
     laps["downsample"] = _clock()
     guess = None if guess is None else as_normalised(guess, scene)
     proposed = [as_normalised(transform, scene) for transform in proposed]
-    found = finding.find_pose(
+    found = find_pose(
         params, scene, coefficients, search, refine=refine, guess=guess, proposals=proposed
     )
     laps["search"] = _clock()

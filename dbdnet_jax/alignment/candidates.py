@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dbdnet_jax.alignment import search
+from dbdnet_jax.alignment import pose_programs
 from dbdnet_jax.alignment.point_to_plane import refine_point_to_plane
 from dbdnet_jax.alignment.success import Coefficients, fit_score
 from dbdnet_jax.alignment.surfaces import PoseFit, Surface, inlier_distance, measure_fit
@@ -21,7 +21,7 @@ from dbdnet_jax.types import Transform
 RESTART_DEG = (-30.0, 30.0)  # turns about the principal axes: they lead out of local minima
 KEPT = 12  # of the coarsely refined poses; the right one is not always among the first six
 # Of those that are ranked: of 237 searches of synthetic scans two had their best pose further down.
-POLISHED = 4
+REFINED_AGAIN = 4
 DIFFERENT_DEG, DIFFERENT = 15.0, 0.2  # degrees, and length: what counts as another pose
 # Of the score, a logarithm of odds: less is no difference. With a guess, it takes more to leave it.
 ALIKE, CLEARLY = 0.5, 3.0
@@ -74,18 +74,20 @@ def examine(
     Poses that are ``close`` to the truth if they are right at all leave out the first step, whose
     wide radius would pull them away where little overlaps.
     """
-    rough, residuals = search.refine_each(starts, source, target, search.COARSE)
+    rough, residuals = pose_programs.refine_each(starts, source, target, pose_programs.COARSE)
     middle = source.points.mean(axis=0)
     rough = [rough[row] for row in _distinct(rough, residuals, middle)[:keep]] + (close or [])
-    fine, residuals = search.refine_each(rough, source, target, search.FINE)
+    fine, residuals = pose_programs.refine_each(rough, source, target, pose_programs.FINE)
     poses = [fine[row] for row in _distinct(fine, residuals, middle)]
     # Normals of few points are rough: there, soft matching may have been nearer the truth.
     soft = rank(poses, source, target, coefficients)
-    poses = [polished(candidate.pose, source, target) for candidate in soft[:POLISHED]]
+    poses = [
+        refined_on_even_points(candidate.pose, source, target) for candidate in soft[:REFINED_AGAIN]
+    ]
     return merged(soft, rank(poses, source, target, coefficients), middle=middle)
 
 
-def polished(pose: Transform, source: Surface, target: Surface) -> Transform:
+def refined_on_even_points(pose: Transform, source: Surface, target: Surface) -> Transform:
     """The pose after a few steps of point-to-plane ICP of the source's even points."""
     distance = inlier_distance(source, target)
     radii = tuple(max(least, by * distance) for least, by in ((0.06, 2.0), (0.04, 1.5)))

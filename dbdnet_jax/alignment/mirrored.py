@@ -8,11 +8,11 @@ import math
 
 import numpy as np
 
-from dbdnet_jax.alignment import search
+from dbdnet_jax.alignment import pose_programs
 from dbdnet_jax.alignment.candidates import examine, far_starts
 from dbdnet_jax.alignment.consensus import agreed_poses, agreement
-from dbdnet_jax.alignment.finding import LIKELY, Found, even_points
 from dbdnet_jax.alignment.normalised import NormalisedPair
+from dbdnet_jax.alignment.search import LIKELY, Found, even_points
 from dbdnet_jax.alignment.success import Coefficients, fit_score
 from dbdnet_jax.alignment.surfaces import inlier_distance, mapped, measure_fit
 from dbdnet_jax.alignment.validity import Trust
@@ -69,7 +69,7 @@ def mirrored_evidence(scene: NormalisedPair, found: Found, coefficients: Coeffic
     best = examine(starts, mirrored, target, coefficients, keep=KEPT, close=poses)[0]
     fit = measure_fit(found.pose, source, target, inlier_distance(source, target))
     rmse, rmse_mirrored = (
-        search.truncated_rmse(pose, even_points(side), even_points(target))
+        pose_programs.truncated_rmse(pose, even_points(side), even_points(target))
         for pose, side in ((found.pose, source), (best.pose, mirrored))
     )
     better_fit = best.score - fit_score(fit, coefficients)

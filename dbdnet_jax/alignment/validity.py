@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dbdnet_jax.alignment.finding import LIKELY, Found
 from dbdnet_jax.alignment.normalised import NormalisedPair, size_ratio
 from dbdnet_jax.alignment.quality import in_words, written
+from dbdnet_jax.alignment.search import LIKELY, Found
 from dbdnet_jax.ops.transforms import angle_between
 
 LOW_OVERLAP, NO_OVERLAP = 0.3, 0.1  # inlier ratios that give a warning, and no valid pose

@@ -29,7 +29,7 @@ class Traits(NamedTuple):
     learned: bool = False  # from weights
     untrained: bool = False  # from fresh ones
     given_overlap: bool = False  # told which points overlap: a bound
-    refined: bool = False  # polished by lengths that are those of a shape in the unit sphere
+    refined: bool = False  # by lengths that are those of a shape in the unit sphere
     aligned: bool = False  # by `align`, as a user calls it
     needs_normals: bool = False
     moves: bool = True  # tries to register at all

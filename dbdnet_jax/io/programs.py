@@ -22,7 +22,7 @@ TRACED = (
     "ops/*.py",
     "classical/refine.py",
     "networks/**/*.py",
-    "alignment/search.py",
+    "alignment/pose_programs.py",
 )
 _FOLDER = "jax_compilation_cache_dir"
 _NOTED = "whole.json"  # the entries that were found whole

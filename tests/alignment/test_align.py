@@ -12,8 +12,8 @@ from scipy.spatial import cKDTree
 from dbdnet_jax import save_params
 from dbdnet_jax.alignment.align import Alignment, align
 from dbdnet_jax.alignment.downsampling import DENSE, downsample
-from dbdnet_jax.alignment.finding import LIKELY
 from dbdnet_jax.alignment.normalised import is_full_resolution, normalise_pair
+from dbdnet_jax.alignment.search import LIKELY
 from dbdnet_jax.alignment.success import (
     Coefficients,
     FitFeatures,
@@ -149,7 +149,7 @@ def test_the_threshold_becomes_the_networks(monkeypatch):
         seen.append(params.config.overlap_threshold)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("dbdnet_jax.alignment.search.predict_pose", ask)
+    monkeypatch.setattr("dbdnet_jax.alignment.pose_programs.predict_pose", ask)
     config = dataclasses.replace(SMALL, overlap_threshold=0.4)
     for options in ({"overlap_threshold": 0.25}, {}):
         with pytest.raises(KeyboardInterrupt):
@@ -166,7 +166,7 @@ def test_a_network_may_be_a_file(tmp_path):
 
 
 def test_a_doubtful_pose_that_was_not_refined_is_told_to_be(monkeypatch):
-    monkeypatch.setattr("dbdnet_jax.alignment.finding.success_probability", lambda *_: 0.1)
+    monkeypatch.setattr("dbdnet_jax.alignment.search.success_probability", lambda *_: 0.1)
     reason = tiny_align(SOURCE, TARGET, initial=TRUE, refine=False).reason
     assert "refine=True may help" in reason and "search=" not in reason
 

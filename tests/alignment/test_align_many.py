@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from dbdnet_jax.alignment import pose_graph, search
+from dbdnet_jax.alignment import pose_graph, pose_programs
 from dbdnet_jax.alignment import validity as verdict
 from dbdnet_jax.alignment.align import Alignment, Matches
 from dbdnet_jax.alignment.align_many import align_many
@@ -198,14 +198,14 @@ def test_nothing_joined_leaves_the_reference_alone(stand_in):
     assert found.connected.tolist() == [True, False]
 
 
-def clueless(params, source, target) -> search.NetworkPose:
+def clueless(params, source, target) -> pose_programs.NetworkPose:
     """A network that knows nothing, and costs no compilation."""
     ones = np.ones(len(source)), np.ones(len(target))
-    return search.NetworkPose(np.eye(4), *ones, np.outer(*ones) / len(target))
+    return pose_programs.NetworkPose(np.eye(4), *ones, np.outer(*ones) / len(target))
 
 
 def test_three_scans_of_a_shape_find_together(monkeypatch):
-    monkeypatch.setattr(search, "predict_pose", clueless)
+    monkeypatch.setattr(pose_programs, "predict_pose", clueless)
     monkeypatch.setattr(verdict, "LIKELY", 0.0)
     true = poses(3, 30.0)
     clouds = [move(np.linalg.inv(pose), solid(190, i)) for i, pose in enumerate(true)]

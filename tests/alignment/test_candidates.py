@@ -86,23 +86,23 @@ def test_each_pose_is_listed_once():
     assert [x.score for x in found] == [2.0, 0.7, 0.5]
 
 
-def test_the_best_ranked_poses_are_polished(sides, monkeypatch):
+def test_the_best_ranked_poses_are_refined_again(sides, monkeypatch):
     wanted = []
 
     def keep(pose, *_):
         wanted.append(pose)
         return pose
 
-    monkeypatch.setattr(candidates, "polished", keep)
+    monkeypatch.setattr(candidates, "refined_on_even_points", keep)
     found = candidates.examine(far_starts(*sides), *sides, load_coefficients())
-    assert len(found) > len(wanted) == candidates.POLISHED
+    assert len(found) > len(wanted) == candidates.REFINED_AGAIN
     for one, pose in zip(found, wanted, strict=False):
         np.testing.assert_array_equal(one.pose, pose)
 
 
-def test_polished_poses_are_among_the_candidates(sides, monkeypatch):
+def test_poses_refined_again_are_among_the_candidates(sides, monkeypatch):
     exact = np.eye(4)
-    monkeypatch.setattr(candidates, "polished", lambda *_: exact)
+    monkeypatch.setattr(candidates, "refined_on_even_points", lambda *_: exact)
     found = candidates.examine(far_starts(*sides)[1:], *sides, load_coefficients())
     assert any((one.pose == exact).all() for one in found)
 

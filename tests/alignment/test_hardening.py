@@ -12,7 +12,7 @@ import pytest
 
 from dbdnet_jax import save_params
 from dbdnet_jax.alignment.arguments import check_options
-from dbdnet_jax.alignment.search import predict_pose
+from dbdnet_jax.alignment.pose_programs import predict_pose
 from dbdnet_jax.alignment.writing import write_ply
 from dbdnet_jax.cli import main
 from dbdnet_jax.cli.statuses import UNUSABLE

@@ -7,7 +7,6 @@ from scipy.spatial.transform import Rotation
 from dbdnet_jax.alignment import mirrored
 from dbdnet_jax.alignment.candidates import Candidate
 from dbdnet_jax.alignment.consensus import match_surfaces
-from dbdnet_jax.alignment.finding import Clues, Found, find_pose
 from dbdnet_jax.alignment.mirrored import (
     PERHAPS,
     RARE,
@@ -16,6 +15,7 @@ from dbdnet_jax.alignment.mirrored import (
     weigh,
 )
 from dbdnet_jax.alignment.normalised import NormalisedPair, as_normalised, normalise_pair
+from dbdnet_jax.alignment.search import Clues, Found, find_pose
 from dbdnet_jax.alignment.success import load_coefficients
 from dbdnet_jax.alignment.surfaces import PoseFit, surface
 from dbdnet_jax.ops.transforms import transform_of

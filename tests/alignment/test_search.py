@@ -1,42 +1,90 @@
-"""Poses refined in a batch: each for itself, on as many points as there are."""
+"""What is searched and found of a pair."""
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from dbdnet_jax.alignment import search
+from dbdnet_jax.alignment.candidates import rank
+from dbdnet_jax.alignment.consensus import agreement
+from dbdnet_jax.alignment.normalised import as_normalised, normalise_pair
+from dbdnet_jax.alignment.search import (
+    Found,
+    find_pose,
+    last_refined,
+)
+from dbdnet_jax.alignment.success import load_coefficients
 from dbdnet_jax.alignment.surfaces import surface
-from dbdnet_jax.classical import refine as em_icp
-from dbdnet_jax.ops.transforms import angle_between, move
-from tests.aligning import motion, solid
+from dbdnet_jax.ops.transforms import angle_between, transform_of
+from tests.aligning import POINTS, solid, tiny_params
+
+COEFFICIENTS = load_coefficients()
 
 
-@pytest.fixture(scope="module")
-def sides():
-    """Two samples of one shape, where they are."""
-    return surface(solid(380, 0)), surface(solid(380, 1))
+def turned_scene():
+    """Two dense partial drawings, the source turned by 150 degrees, and the pose between them."""
+    turn = Rotation.from_rotvec([150, 0, 0], degrees=True).as_matrix()
+    source, target = solid(3000, 3), solid(3000, 4)
+    scene = normalise_pair(source[source[:, 0] < 0.4] @ turn, target, "auto", POINTS)
+    return scene, as_normalised(transform_of(turn, np.zeros(3)), scene)
 
 
-@pytest.mark.parametrize("level", [search.COARSE, search.FINE], ids=["coarse", "fine"])
-def test_starts_are_refined_each_for_itself(sides, level):
-    starts = [motion(seed, 12.0, 0.05) for seed in range(level.batch + 1)]
-    found, residuals = search.refine_each(starts, *sides, level)
-    alone, residual = search.refine_each(starts[-1:], *sides, level)
-    assert len(found) == len(residuals) == len(starts)
-    np.testing.assert_allclose(found[-1], alone[0], atol=1e-5)
-    assert residuals[-1] == pytest.approx(residual[0], rel=1e-3)
-    errors = [angle_between(pose, np.eye(4))[0] for pose in found]
-    assert max(errors) < 5
-    assert np.linalg.norm(move(found[0], np.zeros(3))) < 0.05
+def search_of(scene, how: str) -> Found:
+    options = {"refine": True, "guess": None, "proposals": []}
+    return find_pose(tiny_params(), scene, COEFFICIENTS, how, **options)
 
 
-@pytest.mark.parametrize("count", [300, 1100, 5000])
-def test_refining_takes_as_many_points_as_it_can(monkeypatch, count):
-    seen = []
+def test_matches_propose_poses_of_any_rotation(monkeypatch):
+    scene, true = turned_scene()
+    monkeypatch.setattr(search, "far_starts", lambda *_: [np.eye(4)])  # nothing else leads there
+    found = search_of(scene, "auto")
+    assert angle_between(found.pose, true)[0] < 2
+    agreeing = agreement(found.pose, found.clues.matched)
+    assert agreeing > 20 and found.evidence.agreeing_matches == pytest.approx(np.log1p(agreeing))
 
-    def run(name, function, source, target, *rest):
-        seen.extend(int(cloud[1]) for cloud in (source, target))
-        return np.eye(3), np.ones(3)
 
-    monkeypatch.setattr(search, "_run", run)
-    search.refine(np.eye(4), solid(count, 0), solid(2 * count, 1))
-    assert seen == [min(n, em_icp.MOST_POINTS) for n in (count, 2 * count)]
+def test_near_keeps_to_what_is_near():
+    scene, true = turned_scene()
+    found = search_of(scene, "near")
+    poses = [found.pose, *(other.pose for other in found.others)]
+    assert min(angle_between(pose, true)[0] for pose in poses) > 15
+
+
+@pytest.mark.parametrize(("worse", "taken"), [(0.4, True), (0.6, False)])
+def test_the_last_step_is_taken_unless_it_fits_worse(monkeypatch, worse, taken):
+    source = target = surface(solid(3000, 3))
+    start, refined = np.eye(4), transform_of(np.eye(3), np.array([0.01, 0.0, 0.0]))
+    monkeypatch.setattr(search, "refine_point_to_plane", lambda *_: refined)
+    own = rank([refined], source, target, COEFFICIENTS)[0].score
+    candidate = rank([start], source, target, COEFFICIENTS)[0]._replace(score=own + worse)
+    pose = last_refined(candidate, source, target, COEFFICIENTS).pose
+    assert (pose == (refined if taken else start)).all()
+
+
+def test_the_last_step_ends_on_all_points(monkeypatch):
+    source = target = surface(solid(3000, 3), np.arange(300))
+    used = []
+
+    def keep(pose, source, target, radii, rows):
+        used.append(len(source.points if rows is None else rows))
+        return pose
+
+    monkeypatch.setattr(search, "refine_point_to_plane", keep)
+    last_refined(rank([np.eye(4)], source, target, COEFFICIENTS)[0], source, target, COEFFICIENTS)
+    assert used == [300, 3000]
+
+
+def test_the_others_are_best_first_whichever_is_chosen(monkeypatch):
+    points = solid(300, 3)
+    scene = normalise_pair(points, solid(300, 4), "auto", POINTS)
+    monkeypatch.setattr(search, "stay_or_leave", lambda *_: 1)
+    turns = [Rotation.from_euler("x", 40 * i, degrees=True).as_matrix() for i in range(4)]
+    poses = [transform_of(turn, np.zeros(3)) for turn in turns]
+    sides = scene.source.surface, scene.target.surface
+    rows = [rank([pose], *sides, COEFFICIENTS)[0] for pose in poses]
+    scores = (-2.0, 1.0, 0.5, -1.0)
+    rows = [row._replace(score=score) for row, score in zip(rows, scores, strict=True)]
+    clues = search.find_clues(tiny_params(), scene)
+    found = search.settle(scene, rows, clues, COEFFICIENTS, None, everywhere=True)
+    assert [other.score for other in found.others] == [0.5, -1.0, -2.0]
+    assert found.margin == 0.5

@@ -128,7 +128,7 @@ def test_the_residual_equals_its_definition(crops):
     assert_close(truncated_rmse(*crops, start), expected, Tolerance(rtol=1e-4, atol=0.0))
 
 
-def test_turns_are_polished_each_for_itself(crops):
+def test_turns_are_refined_each_for_itself(crops):
     """About the principal axes through the middle of the moved source, the pose itself first."""
     source, target = crops
     pose = motion(6.0, 0.02)

@@ -23,7 +23,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 
 def likely(monkeypatch, probability: float) -> None:
     """Let the success probability be what a test needs; the tiny network is untrained."""
-    monkeypatch.setattr("dbdnet_jax.alignment.finding.success_probability", lambda *_: probability)
+    monkeypatch.setattr("dbdnet_jax.alignment.search.success_probability", lambda *_: probability)
 
 
 def test_the_summary_goes_to_stdout_and_progress_to_stderr(run, monkeypatch):
@@ -73,10 +73,10 @@ def test_no_refinement_is_asked_for(run, monkeypatch):
         assert refined is False
         pytest.fail("judged")
 
-    monkeypatch.setattr("dbdnet_jax.alignment.finding.settle", settle)
+    monkeypatch.setattr("dbdnet_jax.alignment.search.settle", settle)
     examined = []
     monkeypatch.setattr(
-        "dbdnet_jax.alignment.finding.examine", lambda *_: examined.append(1) or pytest.fail()
+        "dbdnet_jax.alignment.search.examine", lambda *_: examined.append(1) or pytest.fail()
     )
     with pytest.raises(pytest.fail.Exception, match="judged"):
         run("a.ply", "b.ply", "--no-refine")

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dbdnet_jax.alignment import search
+from dbdnet_jax.alignment import pose_programs
 from dbdnet_jax.classical.refine import Refined
 from dbdnet_jax.io import programs
 from dbdnet_jax.io.files import warn_without_cache
@@ -48,7 +48,7 @@ def answer_nothing(params, source, target) -> Registration:
 def test_a_kept_program_depends_on_every_file_that_it_is_traced_through():
     package = Path(programs.__file__).parents[1]
     hashed = {path for name in programs.TRACED for path in package.glob(name)}
-    reached, waiting = set(), [package / "alignment" / "search.py"]
+    reached, waiting = set(), [package / "alignment" / "pose_programs.py"]
     while waiting:
         path = waiting.pop()
         names = [name.split(".") for name in imported_names(path, package.parent)]
@@ -74,25 +74,25 @@ def test_fifty_sizes_are_traced_as_often_as_there_are_buckets(monkeypatch):
         refinements.append((len(source.points), len(target.points)))
         return Refined(Rigid(*start), jnp.zeros(()), jnp.ones((), bool))
 
-    monkeypatch.setattr(search, "register_clouds", register_clouds)
-    monkeypatch.setattr(search.em_icp, "refine", refine)
-    monkeypatch.setattr(search, "_PROGRAMS", {})
+    monkeypatch.setattr(pose_programs, "register_clouds", register_clouds)
+    monkeypatch.setattr(pose_programs.em_icp, "refine", refine)
+    monkeypatch.setattr(pose_programs, "_PROGRAMS", {})
     # Not through files: the stand-in must not be kept as the network's program.
-    monkeypatch.setattr(search, "load_or_trace", lambda function, *rest: jax.jit(function))
+    monkeypatch.setattr(pose_programs, "load_or_trace", lambda function, *rest: jax.jit(function))
     for n, m in np.random.default_rng(0).integers(16, max(BUCKETS) + 1, (50, 2)):
         source, target = random_cloud(n, n), random_cloud(m, m)
-        proposal = search.predict_pose(tiny_params(), source, target)
+        proposal = pose_programs.predict_pose(tiny_params(), source, target)
         assert proposal.mass.shape == (n, m)
         assert proposal.source_overlap.all() and proposal.target_overlap.all()
-        search.refine(proposal.transform, source, target)
+        pose_programs.refine(proposal.transform, source, target)
     for traces in (networks, refinements):
         assert len(traces) == len(set(traces)) <= len(BUCKETS)
         assert {size for pair in traces for size in pair} <= BUCKETS
 
 
 def test_two_functions_of_equal_arguments_are_two_programs(monkeypatch):
-    monkeypatch.setattr(search, "_PROGRAMS", {})
-    one, two = (search._run(f"add {k}", lambda x, k=k: x + k, jnp.ones(3)) for k in (1, 2))
+    monkeypatch.setattr(pose_programs, "_PROGRAMS", {})
+    one, two = (pose_programs._run(f"add {k}", lambda x, k=k: x + k, jnp.ones(3)) for k in (1, 2))
     assert (two - one == 1).all()
 
 
