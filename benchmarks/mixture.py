@@ -1,14 +1,17 @@
 """What weights make of each part of the mixture, on shapes that nothing was trained on.
 
     python -m benchmarks.mixture cad runs/mine/params.npz --count=48
+    python -m benchmarks.mixture cad --model overlap_points=512 overlap_passes=2
 
 A row for the paper's protocol (194 pairs on the validation shapes, those that training chooses by)
 and one for each part of `data.mixture`, drawn from a fixed seed; the hash is of the drawn clouds.
 Overlap accuracy stands beside that of the pairs of which less than half overlaps. `--split=test`
-draws on the test shapes: for the last table, never to choose by.
+draws on the test shapes: for the last table, never to choose by. `--model` changes what the network
+sees and how often, without any training for it.
 """
 
 import argparse
+import dataclasses
 import hashlib
 from typing import NamedTuple
 
@@ -23,6 +26,7 @@ from dbdnet_jax.data.training_pairs import VALIDATION_SEED
 from dbdnet_jax.data.worlds import OTHERS
 from dbdnet_jax.evaluation.methods import Method, from_network
 from dbdnet_jax.evaluation.run import evaluate_method
+from dbdnet_jax.networks.params import Params
 from dbdnet_jax.networks.weights import load_named
 from dbdnet_jax.types import Pair
 
@@ -88,17 +92,26 @@ def row_of(method: Method, pairs: Pair) -> str:
     )
 
 
+def load_changed(name: str, fields: list[str]) -> Params:
+    """Weights whose configuration has other numbers in ``fields``, each ``FIELD=NUMBER``."""
+    params = load_named(name)
+    numbers = {field: int(number) for field, number in (text.split("=") for text in fields)}
+    return dataclasses.replace(params, config=dataclasses.replace(params.config, **numbers))
+
+
 def main() -> None:
     """Read the arguments, draw, print a table for each file of weights."""
     parser = argparse.ArgumentParser("mixture")
     parser.add_argument("weights", nargs="+", help="names in the package or .npz files")
     parser.add_argument("--split", choices=("val", "test"), default="val")
     parser.add_argument("--count", type=int, default=48, help="pairs of each part")
+    parser.add_argument("--model", nargs="+", default=[], metavar="FIELD=NUMBER")
     options = parser.parse_args()
     sets = draw_sets(options.split, options.count)
     for name in options.weights:
-        method = Method("DBDNet", from_network(load_named(name)))  # compiled once
-        print(f"\n{name}, {options.split} shapes\n")
+        params = load_changed(name, options.model)
+        method = Method("DBDNet", from_network(params))  # compiled once
+        print(f"\n{' '.join([name, *options.model])}, {options.split} shapes\n")
         print(
             "| part | sha256 | Error R | median R | Error t | % below 15 degrees and 0.2 | "
             "overlap accuracy | F1 | accuracy where less than half overlaps (pairs) |"

@@ -3,9 +3,9 @@
     python -m tools.ship_weights runs/cad --pairs 32100 32100
     python -m tools.ship_weights runs/overlap runs/registration --pairs 104576 39260
 
-Takes the overlap network of the first run and the registration network of the last (those of the
-joint stage where it has run; its pairs count for both networks), scores them on
-the validation pairs and on the frozen test pairs of configs/cad.py, and writes
+Takes the overlap network of the first run, and the registration network and the configuration of
+the last (those of the joint stage where it has run; its pairs count for both networks), scores them
+on the validation pairs and on the frozen test pairs of configs/cad.py, and writes
 dbdnet_jax/networks/pretrained/NAME.npz. Fit the success probability anew afterwards:
 `python -m tools.fit_success`.
 """
@@ -43,7 +43,7 @@ def main() -> None:
     overlap, registration = (_load(path) for path in (options.runs[0], options.runs[-1]))
     config = read_config(cad.get_config())
     networks = {"overlap": overlap.overlap, "registration": registration.registration}
-    params = Params(networks, config.model)
+    params = Params(networks, registration.config)
     training = load_training_pairs(
         config.data,
         config.protocol,

@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dbdnet_jax.alignment import search
+from dbdnet_jax.alignment import pose_programs, search
 from dbdnet_jax.alignment.candidates import rank
-from dbdnet_jax.alignment.consensus import agreement
+from dbdnet_jax.alignment.consensus import MatchedPoints, agreement
 from dbdnet_jax.alignment.normalised import as_normalised, normalise_pair
+from dbdnet_jax.alignment.pose_programs import NetworkPose
 from dbdnet_jax.alignment.search import (
+    Clues,
     Found,
     find_pose,
     last_refined,
@@ -72,6 +74,36 @@ def test_the_last_step_ends_on_all_points(monkeypatch):
     monkeypatch.setattr(search, "refine_point_to_plane", keep)
     last_refined(rank([np.eye(4)], source, target, COEFFICIENTS)[0], source, target, COEFFICIENTS)
     assert used == [300, 3000]
+
+
+@pytest.mark.parametrize(
+    ("rmse", "agreeing", "turned_deg", "row"),
+    [
+        (1.0, 0, 0, 0),
+        (0.8, 0, 0, 0),  # better, but not clearly
+        (0.7, 0, 0, 1),
+        (0.8, 0, 20, 1),  # refinement had turned the network's pose far
+        (1.0, 19, 0, 1),  # matches speak for it
+        (1.2, 19, 0, 0),
+    ],
+)
+def test_of_sparse_clouds_the_network_s_pose_is_left_for_what_fits_clearly_better(
+    monkeypatch, rmse, agreeing, turned_deg, row
+):
+    side = surface(solid(300, 3))
+    turns = [Rotation.from_euler("x", angle, degrees=True).as_matrix() for angle in (0, 90)]
+    first, other = (transform_of(turn, np.zeros(3)) for turn in turns)
+    away = Rotation.from_euler("z", turned_deg, degrees=True).as_matrix()
+    said = NetworkPose(transform_of(away, np.zeros(3)), np.ones(9), np.ones(9), np.ones((9, 9)))
+    clues = Clues(said, MatchedPoints(np.zeros((1, 3)), np.zeros((1, 3))))
+
+    def of_other(value, usual):
+        return lambda pose, *_: value if (pose == other).all() else usual
+
+    monkeypatch.setattr(pose_programs, "truncated_rmse", of_other(rmse, 1.0))
+    monkeypatch.setattr(search, "agreement", of_other(agreeing, 0))
+    candidates = [rank([pose], side, side, COEFFICIENTS)[0] for pose in (first, other)]
+    assert search.stay_or_leave(candidates, clues, side, side) == row
 
 
 def test_the_others_are_best_first_whichever_is_chosen(monkeypatch):
