@@ -5,9 +5,9 @@
 
 A row for the paper's protocol (194 pairs on the validation shapes, those that training chooses by)
 and one for each part of `data.mixture`, drawn from a fixed seed; the hash is of the drawn clouds.
-Overlap accuracy stands beside that of the pairs of which less than half overlaps. `--split=test`
-draws on the test shapes: for the last table, never to choose by. `--model` changes what the network
-sees and how often, without any training for it.
+Overlap accuracy stands beside that of the pairs of which less than half overlaps; the time is that
+of an answer. `--split=test` draws on the test shapes: for the last table, never to choose by.
+`--model` changes what the network sees and how often, without any training for it.
 """
 
 import argparse
@@ -85,10 +85,12 @@ def row_of(method: Method, pairs: Pair) -> str:
         few = evaluate_method(method, jax.tree.map(lambda leaf: leaf[little], pairs)).overlap
         assert few is not None
         of_little = f"{few.accuracy:.3f} ({little.sum()})"
+    seconds = row.seconds_per_pair
+    milliseconds = "-" if seconds is None else f"{1000 * seconds:.0f}"
     return (
         f"{summary.error_rotation_deg:.2f} | {summary.median_rotation_deg:.2f} | "
         f"{summary.error_translation:.3f} | {100 * right.mean():.1f} | "
-        f"{overlap.accuracy:.4f} | {overlap.f1:.4f} | {of_little}"
+        f"{overlap.accuracy:.4f} | {overlap.f1:.4f} | {of_little} | {milliseconds}"
     )
 
 
@@ -114,9 +116,9 @@ def main() -> None:
         print(f"\n{' '.join([name, *options.model])}, {options.split} shapes\n")
         print(
             "| part | sha256 | Error R | median R | Error t | % below 15 degrees and 0.2 | "
-            "overlap accuracy | F1 | accuracy where less than half overlaps (pairs) |"
+            "overlap accuracy | F1 | accuracy where less than half overlaps (pairs) | ms |"
         )
-        print("|---|---|---|---|---|---|---|---|---|")
+        print("|---|---|---|---|---|---|---|---|---|---|")
         for part, drawn in sets.items():
             print(f"| {part} | {drawn.digest} | {row_of(method, drawn.pairs)} |", flush=True)
 

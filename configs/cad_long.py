@@ -3,10 +3,11 @@
     python train.py --config=configs/cad_long.py
 
 Three times as many shapes, two of three generated; a third of the pairs with low overlap, seen by
-cameras, on floors, in clutter or in rooms; a constant rate until the last 8 epochs, so that the
-command may be given again with more epochs. 108,000 pairs for the overlap network, after which
-more of these shapes gave no more, and 75,000 for the registration network. The weights in the box
-were trained so, but in several runs: docs/training.md has their commands and curves.
+cameras, on floors, in clutter or in rooms; 384 points of each cloud for the overlap network instead
+of 256; a constant rate until the last 8 epochs, so that the command may be given again with more
+epochs. 108,000 pairs for the overlap network, after which more of these shapes gave no more, and
+75,000 for the registration network. The weights in the box were trained so, but in several runs,
+and most of their pairs with 256 points: docs/training.md has their commands and curves.
 """
 
 from ml_collections import ConfigDict
