@@ -1,6 +1,11 @@
 """The paper's tables: what is trained by which command, kept, scored once, and printed."""
 
 import json
+import os
+import signal
+import sys
+import threading
+import time
 
 import jax
 import numpy as np
@@ -9,7 +14,7 @@ import pytest
 from benchmarks.paper import of_data, public, published, tables
 from benchmarks.paper.recipes import RECIPES, Training, configuration, stages, trainings
 from benchmarks.paper.scoring import classical_methods, first, read_row, score_classical, score_runs
-from benchmarks.paper.training import affordable, spent, train
+from benchmarks.paper.training import Stopped, _cpu_seconds, affordable, spent, train
 from dbdnet_jax.data.frozen import cad_test_pairs
 from dbdnet_jax.data.test_pairs import PairSet
 from dbdnet_jax.networks.initial import init_params
@@ -108,6 +113,38 @@ def test_a_run_that_was_stopped_between_the_points_goes_on(tmp_path):
     assert stages_and_pairs(lines) == [("dcp", PAIRS)]
     train(RECIPES["dcp"], Training(), tmp_path, pairs=PAIRS, minutes=30, run=run)
     assert [pairs for _, pairs in stages_and_pairs(lines)] == [1200, 3600, 10800, 17200]
+
+
+def test_what_a_stopped_training_has_used_counts(tmp_path):
+    def stop(line):
+        (tmp_path / "dcp" / "checkpoints" / "40").mkdir(parents=True)
+        raise Stopped(70.0)
+
+    options = {"pairs": PAIRS, "minutes": 30}
+    with pytest.raises(Stopped, match="goes on"):
+        train(RECIPES["dcp"], Training(), tmp_path, **options, run=stop)
+    batch = configuration(RECIPES["dcp"]).stages["dcp"].batch_size
+    assert spent(tmp_path) == {"pairs": {"dcp": 40 * batch}, "cpu_seconds": {"dcp": 70.0}}
+    with pytest.raises(ValueError, match="train those first"):
+        train(RECIPES["dcp"], Training(), tmp_path, **options, points=["minutes"])
+    train(RECIPES["dcp"], Training(), tmp_path, **options, run=standing_in(lines := []))
+    assert stages_and_pairs(lines)[0] == ("dcp", PAIRS)
+    assert spent(tmp_path)["cpu_seconds"]["dcp"] <= 1800
+
+
+def test_a_training_ends_with_the_process_that_started_it(tmp_path):
+    there = tmp_path / "there"
+    code = f"import pathlib, time; pathlib.Path({str(there)!r}).touch(); time.sleep(600)"
+
+    def stop_when_there():
+        while not there.exists():
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=stop_when_there, daemon=True).start()
+    with pytest.raises(Stopped) as stopped:
+        _cpu_seconds([sys.executable, "-c", code])
+    assert stopped.value.seconds > 0
 
 
 def test_the_minutes_go_on_from_the_pairs(tmp_path):

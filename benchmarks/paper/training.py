@@ -18,6 +18,7 @@ from typing import Any
 from benchmarks.paper.recipes import Recipe, Training, configuration, stages
 from dbdnet_jax.data.cad import cad_split
 from dbdnet_jax.io.files import write_atomic
+from dbdnet_jax.training.preemption import Interrupted, interrupt_on_signals
 
 POINTS = ("pairs", "minutes")
 CADENCE = 400  # pairs from one validation, and checkpoint, to the next
@@ -27,6 +28,14 @@ STARTING_S = 40  # of a first call that are no training
 STARTING_AGAIN_S = 15  # of a later one, whose programs are compiled already
 
 Run = Callable[[Sequence[str]], float]  # a command line's CPU seconds
+
+
+class Stopped(SystemExit):
+    """A training was asked to stop with this process; ``seconds`` of the CPU it had used."""
+
+    def __init__(self, seconds: float) -> None:
+        super().__init__("stopped; the same command goes on from here")
+        self.seconds = seconds
 
 
 def train(
@@ -41,8 +50,11 @@ def train(
 ) -> None:
     """Train to the points, in their order, whatever is not there yet.
 
+    What a training that is stopped half-way has used counts, and it goes on from there.
+
     Raises:
         ValueError: minutes without the pairs that they go on from.
+        Stopped: this process was asked to stop.
     """
     config = configuration(recipe)
     names = stages(config)
@@ -51,14 +63,21 @@ def train(
     def advance(stage: str, budget: int) -> None:
         batch = config.stages[stage].batch_size
         line = command(recipe, training, folder, stage, batch, budget)
-        seconds[stage] = seconds.get(stage, 0.0) + (run or _cpu_seconds)(line)
-        seen[stage] = budget
-        _write(folder, seen, seconds)
+        before = seconds.get(stage, 0.0)
+        try:
+            seconds[stage] = before + (run or _cpu_seconds)(line)
+            seen[stage] = budget
+        except Stopped as stopped:
+            seconds[stage] = before + stopped.seconds
+            seen[stage] = batch * _saved_steps(folder / stage)
+            raise
+        finally:
+            _write(folder, seen, seconds)
 
     for point in POINTS:
         if point not in points or (folder / f"{point}.npz").exists():
             continue
-        if point == "minutes" and not set(names) <= seen.keys():
+        if point == "minutes" and not (folder / "pairs.npz").exists():
             raise ValueError(
                 f"the minutes go on from the pairs, and {folder} has none; train those first."
             )
@@ -116,12 +135,27 @@ def spent(folder: Path) -> dict[str, Any] | None:
 
 
 def _cpu_seconds(line: Sequence[str]) -> float:
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    done = subprocess.run(line)
-    if done.returncode:
-        raise SystemExit(f"error: training ended with status {done.returncode}: {' '.join(line)}")
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    before = _used_seconds()
+    with interrupt_on_signals(), subprocess.Popen(line) as child:
+        try:
+            status = child.wait()
+        except Interrupted:
+            child.terminate()  # it saves its state
+            child.wait()
+            raise Stopped(_used_seconds() - before) from None
+    if status:
+        raise SystemExit(f"error: training ended with status {status}: {' '.join(line)}")
+    return _used_seconds() - before
+
+
+def _used_seconds() -> float:
+    """Of the CPU, by the processes that this one has started and that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def _saved_steps(stage: Path) -> int:
+    return max((int(path.name) for path in (stage / "checkpoints").glob("[0-9]*")), default=0)
 
 
 def _read(folder: Path) -> tuple[dict[str, int], dict[str, float]]:
