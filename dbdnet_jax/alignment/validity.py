@@ -8,11 +8,12 @@ from jaxtyping import Float
 
 from dbdnet_jax.alignment.normalised import NormalisedPair, size_ratio
 from dbdnet_jax.alignment.quality import in_words, written
-from dbdnet_jax.alignment.search import LIKELY, Found
+from dbdnet_jax.alignment.search import CONFIDENT, LIKELY, Found
 from dbdnet_jax.ops.transforms import angle_between
 
 LOW_OVERLAP, NO_OVERLAP = 0.3, 0.1  # inlier ratios that give a warning, and no valid pose
-UNEQUAL, INCOMPATIBLE = 2.0, 4.0  # sizes of the clouds that do the same
+# Sizes of the clouds that give a warning and ask for a confident pose, and that give no valid one.
+UNEQUAL, INCOMPATIBLE = 2.0, 4.0
 LINE = 1e-3  # width of what counts as a line, per length
 AS_GOOD = 0.3  # how much the best other pose's score is lower, a logarithm of odds: they fit alike
 
@@ -30,7 +31,8 @@ def rejection_reason(scene: NormalisedPair, found: Found) -> str:
     for name, side in (("source", scene.source), ("target", scene.target)):
         if _is_line(side.sparse):
             return f"the {name}'s points lie on a line: the rotation about it is free"
-    if size_ratio(scene) > INCOMPATIBLE:
+    ratio = size_ratio(scene)
+    if ratio > INCOMPATIBLE or (ratio > UNEQUAL and found.probability < CONFIDENT):
         return _unequal(scene)
     inliers = found.quality.inlier.mean()
     if inliers < NO_OVERLAP:

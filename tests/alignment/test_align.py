@@ -171,6 +171,15 @@ def test_a_doubtful_pose_that_was_not_refined_is_told_to_be(monkeypatch):
     assert "refine=True may help" in reason and "search=" not in reason
 
 
+@pytest.mark.parametrize(("probability", "valid"), [(0.8, False), (0.95, True)])
+def test_clouds_of_unequal_sizes_need_a_confident_pose(monkeypatch, probability, valid):
+    monkeypatch.setattr("dbdnet_jax.alignment.search.success_probability", lambda *_: probability)
+    monkeypatch.setattr("dbdnet_jax.alignment.validity.size_ratio", lambda _: 2.5)
+    answer = tiny_align(SOURCE, TARGET, initial=TRUE, refine=False)
+    assert any("are both in the same unit?" in text for text in answer.warnings)
+    assert answer.valid == valid and ("same unit" in answer.reason) != valid
+
+
 def test_thinning_keeps_shape_and_forgets_density_and_strays():
     points = solid(200_000, 5)
     points[0] = 1e6
