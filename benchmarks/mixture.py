@@ -111,7 +111,10 @@ def main() -> None:
     options = parser.parse_args()
     sets = draw_sets(options.split, options.count)
     for name in options.weights:
-        params = load_changed(name, options.model)
+        try:
+            params = load_changed(name, options.model)
+        except (TypeError, ValueError, OSError) as error:
+            parser.error(str(error))
         method = Method("DBDNet", from_network(params))  # compiled once
         print(f"\n{' '.join([name, *options.model])}, {options.split} shapes\n")
         print(
